@@ -17,7 +17,7 @@ from phyradgs_cl.estimate import duration, estimate, seconds_around
 from phyradgs_cl.io import partial_path, refuse_overwriting
 from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
-from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, Report
+from phyradgs_cl.reconstructors import Progress, ProgressReport, Reconstruction
 from phyradgs_cl.reconstructors.moving import motion_line
 from phyradgs_cl.reconstructors.result import COMPARED, DOUBT, MOTION_FOUND, option_facts
 from phyradgs_cl.runtime import Runtime, profile_text
@@ -80,6 +80,10 @@ def reconstruct_command(
         stage("building kernels")
         return runtimes[-1]
 
+    def told(progress: Progress) -> None:
+        for listener in listeners:
+            listener(progress)
+
     inputs = [path for path in (settings.config, initial, object_motion) if path is not None]
     files = scan, output, partial_path(output), *inputs
     listeners: list[ProgressReport] = [ticker.progress]
@@ -100,7 +104,7 @@ def reconstruct_command(
             picture = report.Preview(preview)
             listeners.append(picture)
         result, metrics = run_reconstruction(
-            plan, scan, output, runtime, Report(*listeners), resume=resume,
+            plan, scan, output, runtime, told, resume=resume,
             checkpoint_every_s=checkpoint_every, inputs=inputs, ranks=ranks,
             slabs=Slabs(None if rows is None else rows_of(rows), slab),
         )

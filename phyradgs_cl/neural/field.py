@@ -203,16 +203,13 @@ def corners(positions: torch.Tensor, cells: int, size: int) -> tuple[torch.Tenso
     is_dense = side**3 <= size
     strides = (1, side, side * side) if is_dense else _FACTORS
     first = [whole[axis] * stride for axis, stride in enumerate(strides)]
-    ends = [torch.stack([start, start + stride]) for start, stride in zip(first, strides, strict=True)]
-    shares = [torch.stack([low_share[axis], high_share[axis]]) for axis in range(3)]
-    x, y, z = (ends[axis].reshape(_corner_shape(axis)) for axis in range(3))
+    (x, wx), (y, wy), (z, wz) = (
+        (torch.stack([start, start + stride]), torch.stack([low_share[axis], high_share[axis]]))
+        for axis, (start, stride) in enumerate(zip(first, strides, strict=True))
+    )
+    y, wy, z, wz = y[:, None], wy[:, None], z[:, None, None], wz[:, None, None]
     index = x + y + z if is_dense else (x ^ y ^ z) % size
-    wx, wy, wz = (shares[axis].reshape(_corner_shape(axis)) for axis in range(3))
     return index.reshape(8, -1), (wx * wy * wz).reshape(8, -1)
-
-
-def _corner_shape(axis: int) -> tuple[int, int, int, int]:
-    return (2 if axis == 2 else 1, 2 if axis == 1 else 1, 2 if axis == 0 else 1, -1)
 
 
 def weighted_rows(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
@@ -284,22 +281,20 @@ def _in_rows(
     ``order``. A row of points is extended beyond the grid to fill its last segment."""
     fine = grid.finer(points)
     slow, middle, fast = fine.axes_mm()
+    slows, middles, fasts = grid.shape
     filled = ceil_div(fast.size, field.segment) * field.segment
     fast = np.concatenate([fast, fast[-1] + fine.voxel_size_mm[2] * np.arange(1, filled - fast.size + 1)])
-    slows, middles, fasts = grid.shape
-    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # each row's place on the first two axes
-    rows[..., 0], rows[..., 1] = slow.reshape(slows, 1, points, 1), middle.reshape(1, middles, 1, points)
-    rows = rows.reshape(slows * middles, points**2, 2)
+    # each row's place on the first two axes: the rows of one voxel follow each other
+    rows = np.stack(np.meshgrid(slow, middle, indexing="ij"), -1).reshape(slows, points, middles, points, 2)
+    rows = rows.swapaxes(1, 2).reshape(slows * middles, points**2, 1, 2)
     values = np.empty((slows * middles, fasts), np.float32)
     at_once = max(points_at_once // (filled * points**2), 1)
     for start in range(0, len(rows), at_once):
-        part = rows[start : start + at_once].reshape(-1, 2)
-        positions = np.empty((len(part), filled, 3), np.float32)
-        places = (part[:, :1], part[:, 1:], fast)
-        for axis, place in zip(order, places, strict=True):
-            positions[..., 2 - axis] = place
-        brick: np.ndarray = to_array(field(to_tensor(positions.reshape(-1, 3), device))).reshape(len(part), filled)
-        brick = brick[:, : fasts * points].reshape(-1, points**2, fasts, points)
+        part = np.broadcast_to(rows[start : start + at_once], (min(at_once, len(rows) - start), points**2, filled, 2))
+        places = np.concatenate([part, np.broadcast_to(fast[:, None], (*part.shape[:3], 1))], -1)
+        positions = places[..., np.argsort(order)[::-1]].reshape(-1, 3).astype(np.float32)  # x, y, z
+        brick: np.ndarray = to_array(field(to_tensor(positions, device))).reshape(*part.shape[:3])
+        brick = brick[..., : fasts * points].reshape(-1, points**2, fasts, points)
         values[start : start + at_once] = brick.mean((1, 3))
     return values.reshape(grid.shape)
 

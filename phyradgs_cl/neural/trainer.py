@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch.nn.utils import parameters_to_vector
 
 from phyradgs_cl.acquisition import OwnTimes, PerRow, Scan
 from phyradgs_cl.acquisition.time_cells import TimeCells
@@ -18,6 +19,7 @@ from phyradgs_cl.neural.field import NeuralField, repeatable, to_array, to_tenso
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
 _BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's decay rates of both moments, and the constant added to its denominator
+_MOMENTS = "exp_avg", "exp_avg_sq"  # PyTorch's names of Adam's moments
 _POINTS_ON_CPU = 2**14  # most points at which a CPU evaluates the field at once: their values fit in its cache
 _POINTS_ELSEWHERE = 2**20  # most points at which any other device evaluates the field at once: they fit in a GPU's memory
 _BEYOND_VOLUME = 2.0  # parallel rays begin this many halves of the volume's longest side from its centre: beyond its corners
@@ -100,10 +102,11 @@ class Trainer:
         return values * np.float32(self.density_per_mm), grid
 
     def state(self) -> dict[str, np.ndarray]:
-        moments = [self._flat([self._moments(p)[k] for p in self.field.parameters()]) for k in range(2)]
+        own = list(self.field.parameters())
+        moments = [[self._adam.state.get(p, {}).get(name, torch.zeros_like(p)) for p in own] for name in _MOMENTS]
         return {
-            "parameters": self._flat([p.detach() for p in self.field.parameters()]),
-            "moments": np.stack(moments),
+            "parameters": to_array(parameters_to_vector(own)),
+            "moments": np.stack([to_array(parameters_to_vector(of_all)) for of_all in moments]),
             "steps": np.array(self.steps),
             "updates": np.array(self.updates),
             "queue": np.array(self.queue, np.int64),
@@ -116,16 +119,15 @@ class Trainer:
         self.rng.bit_generator.state = json.loads(str(state["rng"]))
         self.steps, self.updates = int(state["steps"]), int(state["updates"])
         self.queue, self.losses = state["queue"].tolist(), state["losses"].tolist()
-        first = 0
+        own, arrays = list(self.field.parameters()), (state["parameters"], *state["moments"])
+        parts = (to_tensor(array, self.device).split([p.numel() for p in own]) for array in arrays)
         with torch.no_grad():
-            for p in self.field.parameters():
-                part = slice(first, first + p.numel())
-                p.copy_(to_tensor(state["parameters"][part], self.device).reshape(p.shape))
-                mean, square = (to_tensor(m[part], self.device).reshape(p.shape) for m in state["moments"])
+            for p, *all_three in zip(own, *parts, strict=True):
+                values, *moments = (one.reshape(p.shape).clone() for one in all_three)
+                p.copy_(values)
                 if self.updates:
                     step = torch.tensor(float(self.updates))
-                    self._adam.state[p] = {"step": step, "exp_avg": mean, "exp_avg_sq": square}
-                first += p.numel()
+                    self._adam.state[p] = {"step": step, **dict(zip(_MOMENTS, moments, strict=True))}
 
     def _shuffled(self) -> list[int]:
         return self.rng.permutation(self.scan.frames).tolist()
@@ -142,8 +144,7 @@ class Trainer:
         usable = np.zeros(scan.geometry.detector_shape, bool)
         usable[self._shadows[frame]] = True
         if scan.pixel_mask is not None:
-            mask = np.asarray(scan.pixel_mask)
-            usable &= (mask[frame] if mask.ndim == 3 else mask) == 0
+            usable &= np.broadcast_to(scan.pixel_mask, scan.projections.shape)[frame] == 0
         if options.positive_only:
             usable &= scan.projections[frame] > 0
         if isinstance(options, LineOptions):
@@ -186,16 +187,6 @@ class Trainer:
         if self.model == "intensity":
             return (intensity_average(integrals, self.unit) - wanted) ** 2
         return log_squares(integrals, wanted, times)
-
-    def _moments(self, parameter: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        state = self._adam.state.get(parameter)
-        if not state:
-            return torch.zeros_like(parameter), torch.zeros_like(parameter)
-        return state["exp_avg"], state["exp_avg_sq"]
-
-    @staticmethod
-    def _flat(tensors: list[torch.Tensor]) -> np.ndarray:
-        return np.concatenate([to_array(t).ravel() for t in tensors])
 
 
 @dataclass(frozen=True, eq=False)

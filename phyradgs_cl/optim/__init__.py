@@ -136,9 +136,7 @@ class DensityControl(checks.Checked):
 
     def allows(self, scale: np.ndarray) -> np.ndarray:
         """Returns which Gaussians of scales (3, G) are not too thin for ``prune_aspect``, bool (G,)."""
-        if self.prune_aspect <= 0:
-            return np.ones(scale.shape[1], bool)
-        return np.asarray(scale.max(0) <= self.prune_aspect * scale.min(0))
+        return np.asarray(scale.max(0) <= (self.prune_aspect or np.inf) * scale.min(0))
 
     def is_due(self, iteration: int, iterations: int) -> bool:
         """Returns whether a round of density control is due after ``iteration``, counted from 1, of ``iterations``."""
@@ -204,12 +202,9 @@ def prune(
 def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray:
     """Returns which numbers in ``statistic`` reach the threshold, bool (G,). If more than ``room`` do, returns only the
     ``room`` largest."""
-    chosen = statistic >= threshold
-    if int(chosen.sum()) > room:
-        order = np.argsort(-statistic, kind="stable")[:room]
-        chosen = np.zeros_like(chosen)
-        chosen[order] = statistic[order] >= threshold
-    return chosen
+    chosen = np.zeros(statistic.shape, bool)
+    chosen[np.argsort(-statistic, kind="stable")[:room]] = True
+    return chosen & (statistic >= threshold)
 
 
 def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:

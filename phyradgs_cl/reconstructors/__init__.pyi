@@ -14,7 +14,6 @@ from .preprocess import Preprocessing as Preprocessing
 from .result import Progress as Progress
 from .result import ProgressReport as ProgressReport
 from .result import Reconstruction as Reconstruction
-from .result import Report as Report
 from .result import ignore_progress as ignore_progress
 from .result import interrupted as interrupted
 from .run import reconstruct as reconstruct

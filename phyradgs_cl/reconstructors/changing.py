@@ -17,7 +17,7 @@ from phyradgs_cl.errors import OutOfMemoryError
 from phyradgs_cl.fields import States
 from phyradgs_cl.objective import TvProx
 from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.result import Reconstruction, Report
+from phyradgs_cl.reconstructors.result import Reconstruction, through
 from phyradgs_cl.reconstructors.voxels.fista import Fista
 from phyradgs_cl.reconstructors.voxels.priors import PriorWeight, TvPrior, axis_weights, frame_error
 from phyradgs_cl.reconstructors.voxels.run import Iterations, IterativeOptions, MethodRun
@@ -56,8 +56,8 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
     times_s = state_times_s(scan, options.states)
     shape = (len(times_s), *scan.grid.shape)
     run = MethodRun(scan, options, rt, state_times_s=times_s, **arguments)
-    initial, report = None if run.initial is None else np.broadcast_to(run.initial, shape), Report.of(run.report)
-    run = replace(run, initial=initial, report=report)
+    report = through(lambda progress: replace(progress, states=states), run.report)
+    run = replace(run, initial=None if run.initial is None else np.broadcast_to(run.initial, shape), report=report)
     try:
         system = run.system(volumes=_STACKS, frames=_FRAMES)
         prox = TvProx(rt, shape, (options.time_weight, *axis_weights(scan.grid)))
@@ -70,8 +70,7 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
         def states() -> States:
             return States(times_s, system.space.numpy(method.volume))
 
-        with report.through(lambda progress: replace(progress, states=states)):
-            result = run.result("changing", Iterations(method, run))
+        result = run.result("changing", Iterations(method, run))
     except OutOfMemoryError as error:
         error.remedy = f"take fewer of the {len(times_s)} states with --set states=N, or a smaller --size"
         raise

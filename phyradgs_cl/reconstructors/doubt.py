@@ -31,10 +31,10 @@ from phyradgs_cl.detector.noise_level import noise_map
 from phyradgs_cl.fields import Deformation, Gaussians, Grid, States
 from phyradgs_cl.metrics.coverage import object_voxels
 from phyradgs_cl.reconstructors.checkpoint import State
+from phyradgs_cl.reconstructors.fdk.arc import distinct_views
 from phyradgs_cl.reconstructors.fdk.travel import travels
-from phyradgs_cl.reconstructors.fdk.views import distinct_views
 from phyradgs_cl.reconstructors.projected import FRAMES_AT_A_TIME, FramePair, frame_pairs, spread_frames
-from phyradgs_cl.reconstructors.result import DOUBT, Progress, Reconstruction, Report
+from phyradgs_cl.reconstructors.result import DOUBT, Progress, ProgressReport, Reconstruction, through
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import without_warnings
 
@@ -135,7 +135,7 @@ def halves(scan: Scan) -> tuple[Array, Array]:
     then sees another height."""
     pose = middle_poses(scan)
     view, angles_rad = distinct_views(azimuth_rad(pose))
-    if len(angles_rad) < FEWEST_FRAMES or travels(pose[:, None, None], scan.projections.shape[1], scan.is_parallel):
+    if len(angles_rad) < FEWEST_FRAMES or travels(pose, scan.projections.shape[1], scan.is_parallel):
         view = np.arange(scan.frames)
     return np.flatnonzero(view % 2 == 0), np.flatnonzero(view % 2 == 1)
 
@@ -154,16 +154,16 @@ class Doubter:
     seed: int
     kind: str = "iterative"
 
-    def run(self, once: Callable[..., Reconstruction], report: Report, resume: State | None) -> Reconstruction:
+    def run(self, once: Callable[..., Reconstruction], report: ProgressReport, resume: State | None) -> Reconstruction:
         """Returns the method's result with ``doubt``, or a partial result after an interruption. once: runs the method on a
-        scan, from a state or, with None, from the start. resume: the state of an interrupted ``run``."""
+        scan, from a state or, with None, from the start, with a report. resume: the state of an interrupted ``run``."""
         arrays = dict(resume or {})
         results = _restored({name: arrays.pop(name) for name in list(arrays) if name.startswith(_KEPT)}, self.scan.grid)
         while len(results) < RUNS:
             scan = self.scan_of_run(results[0], len(results)) if results else self.scan
             half = without_warnings() if results and self.kind == "analytic" else nullcontext()  # FDK warns of half scans
-            with report.through(partial(_counted, results=results)), half:
-                result = once(scan, arrays or None)
+            with half:
+                result = once(scan, arrays or None, through(partial(_counted, results=results), report))
             if result.state is not None:
                 return _interrupted(result, results)
             results, arrays = [*results, result], {}

@@ -57,9 +57,7 @@ NAF_PUBLISHED = NeuralOptions(
     base_resolution=16, table_log2=19, density_bound=1.0, first_share=0.5, rate=1e-3, rate_factor=0.1,
     rate_step=1500,
 )
-NAF_PRESETS = {"default": NeuralOptions(), "published": NAF_PUBLISHED}
-
-NAF = Method(partial(reconstruct_neural, method="naf"), NAF_PRESETS)
+NAF = Method(partial(reconstruct_neural, method="naf"), {"default": NeuralOptions(), "published": NAF_PUBLISHED})
 
 
 # SAX-NeRF's released configuration Lineformer/chest_50 is NAF's with 256 samples per ray for 128 voxels per side.

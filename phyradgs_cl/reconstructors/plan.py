@@ -235,7 +235,11 @@ class RunPlan:
 
     def identity(self, scan: Scan) -> dict[str, Any]:
         """Returns everything that a run must share with the interrupted run that it continues. Reads all frames."""
-        grid = scan.grid
+        grid, moves = scan.grid, {}
+        if self.object_motion is not None:
+            one = self.object_motion.deformation
+            place = np.array([one.origin_mm, one.spacing_mm])
+            moves["object_motion"] = _digest(one.control_mm, place, one.times_s, one.weights)
         return {
             "scan": _digest(scan.projections, np.packbits(scan.valid), *_geometry(scan)),
             "grid": [grid.shape, *(np.round(three, _DECIMALS).tolist() for three in (grid.voxel_size_mm, grid.offset_mm))],
@@ -244,7 +248,7 @@ class RunPlan:
             "input": self.preprocessing.facts(),
             **option_facts(self.options),
             "initial": None if self.initial is None else _digest(self.initial.values.astype(np.float32)),
-            **({} if self.object_motion is None else {"object_motion": _deformation_digest(self.object_motion.deformation)}),
+            **moves,
         }
 
 
@@ -254,10 +258,6 @@ def _geometry(scan: Scan) -> Iterator[np.ndarray]:
     span_s = np.array([0.0, scan.shutter.span_s])
     for frame, start_s in enumerate(scan.frame_start_s):
         yield np.round(scan.trajectory.pose(frame, start_s + span_s), _DECIMALS) + 0.0  # adding 0.0 turns -0 into 0
-
-
-def _deformation_digest(one: Deformation) -> str:
-    return _digest(one.control_mm, np.array([one.origin_mm, one.spacing_mm]), one.times_s, one.weights)
 
 
 def _digest(*arrays: np.ndarray) -> str:

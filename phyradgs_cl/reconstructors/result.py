@@ -1,7 +1,6 @@
 """The result of every method, and its progress reports."""
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -220,32 +219,14 @@ class Progress:
 ProgressReport = Callable[[Progress], None]
 
 
-class Report:
-    """Passes a method's progress on to listeners. Hooks that ``through`` installs may change the progress before."""
+def through(hook: Callable[[Progress], Progress], report: ProgressReport) -> ProgressReport:
+    """Returns a report that gets progress as ``hook`` changes it."""
+    return lambda progress: report(hook(progress))
 
-    def __init__(self, *listeners: ProgressReport) -> None:
-        self.listeners = listeners
-        self._hooks: list[Callable[[Progress], Progress]] = []
 
-    @classmethod
-    def of(cls, report: ProgressReport) -> "Report":
-        """Returns ``report`` as a ``Report``: itself if it is one, else one that calls the function ``report``."""
-        return report if isinstance(report, Report) else cls(report)
-
-    def __call__(self, progress: Progress) -> None:
-        for hook in reversed(self._hooks):
-            progress = hook(progress)
-        for listener in self.listeners:
-            listener(progress)
-
-    @contextmanager
-    def through(self, hook: Callable[[Progress], Progress]) -> Iterator[None]:
-        """Sends progress through ``hook``, and then through earlier hooks, while the body of the with statement runs."""
-        self._hooks.append(hook)
-        try:
-            yield
-        finally:
-            self._hooks.pop()
+def labelled(label: str, report: ProgressReport) -> ProgressReport:
+    """Returns a report that gets progress under the name ``label``, without a state, as it has no checkpoint."""
+    return through(lambda progress: replace(progress, quantity=f"{label}: {progress.quantity}", state=None), report)
 
 
 def ignore_progress(progress: Progress) -> None:

@@ -36,8 +36,8 @@ from phyradgs_cl.reconstructors.result import (
     Progress,
     ProgressReport,
     Reconstruction,
-    Report,
     ignore_progress,
+    through,
 )
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import each_warning_once
@@ -63,14 +63,15 @@ def reconstruct(
 
     The plan's first volume is resampled onto the scan's grid. Raises InputError for a scan or state that the plan cannot
     take, and OutOfMemoryError if the memory of the host or the device is too small."""
-    run, report = _Prepared(scan, plan, rt, resume), Report.of(report)
+    run = _Prepared(scan, plan, rt, resume)
     method, state = method_of(plan.method), run.arguments.pop("resume", None)
 
-    def once(visible: Scan, state: State | None) -> Reconstruction:
+    def once(visible: Scan, state: State | None, report: ProgressReport) -> Reconstruction:
         arguments = run.arguments if state is None else {**run.arguments, "resume": state}
         return method.run(visible, run.options, rt=rt, seed=plan.seed, report=report, **arguments)
 
-    with report.through(run.shown), _naming_size_that_fits(rt, run.scan, plan), naming_host_memory():
+    report = through(run.shown, report)
+    with _naming_size_that_fits(rt, run.scan, plan), naming_host_memory():
         if plan.preprocessing.doubt:
             kind = "iterative" if hasattr(run.options, "iterations") else "analytic"
             if plan.method not in MEASURED:
@@ -79,7 +80,7 @@ def reconstruct(
             doubter = Doubter(rt, run.visible, run.scan, run.hidden, run.deformation, plan.seed, kind)
             result = doubter.run(once, report, state)
         else:
-            result = once(run.visible, state)
+            result = once(run.visible, state, report)
     return run.finished(result)
 
 

@@ -104,7 +104,10 @@ def load_reference(path: Path, mu_water_per_mm: float | None = None) -> tuple[Vo
 def summary(path: Path) -> dict[str, object]:
     if (form := importers.foreign_volume(path)) is not None:
         if states := [(time_s, _voxel_facts(volume)) for time_s, volume in importers.load_states(path)]:
-            return {"kind": f"volumes of an object that moves ({form})", **_facts_of_states(states)}
+            (first_s, *_), every = zip(*states, strict=True)
+            times = {"states": len(states), "first_s": first_s, "last_s": states[-1][0]}
+            extremes = {"minimum": min(f["minimum"] for f in every), "maximum": max(f["maximum"] for f in every)}
+            return {"kind": f"volumes of an object that moves ({form})", **times, **every[0], **extremes}
         return {"kind": f"volume ({form})", **_voxel_facts(importers.load_volume(path))}
     with expecting(path, "scan", "volume", "plain-volume", "deformation"):
         kind = file_kind(path)
@@ -126,15 +129,7 @@ def summary(path: Path) -> dict[str, object]:
     return {"kind": "bare volume", **_voxel_facts(importers.load_volume(path))}
 
 
-def _facts_of_states(states: list[tuple[float, dict[str, Any]]]) -> dict[str, object]:
-    """Summarises volumes at several times: their number, times and extremes, and other facts of the first volume."""
-    times = {"states": len(states), "first_s": states[0][0], "last_s": states[-1][0]}
-    lowest = min(facts["minimum"] for _, facts in states)
-    highest = max(facts["maximum"] for _, facts in states)
-    return {**times, **states[0][1], "minimum": lowest, "maximum": highest}
-
-
-def _voxel_facts(volume: Volume) -> dict[str, object]:
+def _voxel_facts(volume: Volume) -> dict[str, Any]:
     values, grid = volume.values, volume.grid
     where = {} if grid is None else {"voxel_size_mm": grid.voxel_size_mm, "offset_mm": grid.offset_mm}
     unit = {VALUES: FROM_HU} if volume.provenance.get(VALUES) == FROM_HU else {}

@@ -104,7 +104,14 @@ def run_reconstruction(
         check_resumable(plan)
     with only_run(output) if leads else nullcontext():
         if parts:
-            return _in_slabs(plan, scan, output, parts, make_runtime(), report, resume)
+            rt = make_runtime()
+            with hashing(scan) as scan_hash_of:
+                result = reconstruct_slabs(plan, scan, output, parts, rt, report, resume=resume)
+                scan_hash = scan_hash_of()
+            with signals.finish_despite_interrupt():
+                write_volume(output, result.volume, result.grid, _provenance(result, scan_hash, plan, scan, rt))
+            remove_slabs(output)
+            return result, {}
         return _reconstructed(plan, scan, output, make_runtime, report, resume, checkpoint_every_s)
 
 
@@ -125,19 +132,6 @@ def _slabs_of(plan: methods.RunPlan, slabs: Slabs, scan: Path, ranks: Communicat
     return parts
 
 
-def _in_slabs(
-    plan: methods.RunPlan, path: Path, output: Path, slabs: list[tuple[int, int]], rt: Runtime,
-    report: methods.ProgressReport, resume: bool,
-) -> tuple[methods.Reconstruction, dict[str, float]]:
-    with hashing(path) as scan_hash_of:
-        result = reconstruct_slabs(plan, path, output, slabs, rt, report, resume=resume)
-        scan_hash = scan_hash_of()
-    with signals.finish_despite_interrupt():
-        write_volume(output, result.volume, result.grid, _provenance(result, scan_hash, plan, path, rt))
-    remove_slabs(output)
-    return result, {}
-
-
 def _reconstructed(
     plan: methods.RunPlan, path: Path, output: Path, make_runtime: Callable[[], Runtime],
     report: methods.ProgressReport, resume: bool, checkpoint_every_s: float,
@@ -154,9 +148,13 @@ def _reconstructed(
     elif leads:
         _set_aside(output)
     checkpoints = _Checkpoints(checkpoint_path(output), checkpoint_every_s)
+
+    def told(progress: methods.Progress) -> None:
+        report(progress)
+        checkpoints(progress)
+
     with checkpoints.mentioned_in_errors():
-        report = methods.Report(*methods.Report.of(report).listeners, checkpoints)
-        result = methods.reconstruct(scan, plan, rt, report=report, resume=state)
+        result = methods.reconstruct(scan, plan, rt, report=told, resume=state)
         if not leads:
             return result, {}
         with signals.finish_despite_interrupt():

@@ -5,7 +5,6 @@ A slab has the times of its rows: the motion model ``static`` takes the middle o
 import logging
 import shutil
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import read_scan_header
 from phyradgs_cl.io.files import host_bytes
 from phyradgs_cl.io.output import beside, written_beside
-from phyradgs_cl.reconstructors.result import option_facts
+from phyradgs_cl.reconstructors.result import labelled, option_facts
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import each_warning_once
 from phyradgs_cl.workflow.files import load_scan
@@ -96,8 +95,8 @@ def reconstruct_slabs(
             continue
         chosen.append(slices)
         if (kept := store.slab(first, stop)) is None:
-            label = f"slab {number} of {len(slabs)}, rows {first}:{stop}: "
-            result = _slab(plan, path, whole, (first, stop), rt, partial(_pass_on, report, label))
+            label = f"slab {number} of {len(slabs)}, rows {first}:{stop}"
+            result = _slab(plan, path, whole, (first, stop), rt, labelled(label, report))
             facts, seconds = result.facts, seconds + float(result.facts["seconds"])
             kept = store.keep(first, stop, result.volume)
         parts.append(kept)
@@ -125,11 +124,6 @@ def _slab(
         log.warning("interrupted in rows %d:%d; the slabs before are kept: repeat with --resume to continue", first, stop)
         raise KeyboardInterrupt
     return result
-
-
-def _pass_on(report: methods.ProgressReport, label: str, progress: methods.Progress) -> None:
-    """Reports a slab's progress under its name, without a state: a slab has no checkpoint."""
-    report(replace(progress, quantity=label + progress.quantity, state=None))
 
 
 class _Store:

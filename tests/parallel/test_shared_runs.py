@@ -53,8 +53,8 @@ def test_a_batch_s_gradient_is_the_sum_of_its_frames(scan) -> None:
     """Sub-volumes and parameter terms included: each frame brings its own."""
     run = started(scan, replace(OPTIONS, parameter_terms_from=0), Runtime())
     batch, download = run.next_batch(), run.rt.download
-    run.cloud.activate(run.adam)
-    run.sharing.differentiate(run.frame_step, run.cloud, batch)
+    run.adam.activate(run.cloud.raw, run.cloud.gaussians.rows, run.cloud.count, run.cloud.gaussians.stride)
+    run.frame_step.differentiate(run.cloud, batch)
     found, statistics = download(run.cloud.gradients)[:11], run.cloud.read_statistics()
     total, single = np.zeros_like(found, np.float64), run.rt.zeros(run.cloud.statistics.shape)
     for frame, corner in zip(batch.frames, batch.corners, strict=True):

@@ -15,7 +15,6 @@ from phyradgs_cl.operators import IntensityOperator, RayOperator
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.reconstructors import Reconstruction, plan_run, reconstruct
 from phyradgs_cl.reconstructors.projected import frame_pairs
-from phyradgs_cl.reconstructors.result import Report
 
 pytestmark = pytest.mark.slow
 
@@ -113,7 +112,7 @@ def test_states_come_back_and_help_each_other_by_a_price_of_change(rt, scan) -> 
 
 def test_resumed_runs_have_the_same_bits(rt, scan) -> None:
     plan, states = plan_run("changing", {"iterations": 6, "states": 5}), []
-    whole = reconstruct(scan, plan, rt, report=Report(lambda p: states.append(p.state()) if p.iteration == 3 else None))
+    whole = reconstruct(scan, plan, rt, report=lambda p: states.append(p.state()) if p.iteration == 3 else None)
     resumed = reconstruct(scan, plan, rt, resume=states[0])
     np.testing.assert_array_equal(resumed.states.volumes, whole.states.volumes)
     np.testing.assert_array_equal(resumed.volume, whole.volume)

@@ -16,6 +16,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume, ramp_filter, ramp_spectrum, static_fdk
 from phyradgs_cl.reconstructors.fdk.frames import extrapolated, reprojected
+from phyradgs_cl.reconstructors.fdk.views import Views
 
 VIEWS, PIXELS, VOXELS = 90, 48, 32
 
@@ -208,7 +209,7 @@ def test_rows_go_on_as_a_volume_has_them(rt, axis) -> None:
     whole = frames_of(body, full, (8, 40), axis)
     poses = half if axis == "rows" else half[:, 10:30]
     frames = whole[..., 10:30]
-    found, count = reprojected(rt, frames, poses, axis, body.voxelise(grid), grid)
+    found, count = reprojected(rt, frames, Views(poses, frames.shape[1:], axis), body.voxelise(grid), grid)
     np.testing.assert_array_equal(found[..., count : count + 20], frames)
     assert count >= 10 and np.abs(whole[..., :10]).max() > 0.1
     off = found[..., count - 10 : count + 30] - whole

@@ -14,7 +14,7 @@ from phyradgs_cl.metrics import psnr
 from phyradgs_cl.reconstructors import METHODS, InitialVolume, plan_run, reconstruct
 from phyradgs_cl.reconstructors.voxels import priors
 from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions, fista
-from phyradgs_cl.reconstructors.voxels.priors import FrameError, OwnPrior, Prior, PriorWeight, prior_of
+from phyradgs_cl.reconstructors.voxels.priors import FrameError, OwnPrior, Prior, PriorWeight, kind_of
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import DeviceSpace, Runtime
 
@@ -58,7 +58,7 @@ def test_subsets_that_pull_apart_at_once_or_slowly_are_joined(rt, scan, system) 
     """One frame a subset, with momentum, diverges; joined it ends near the whole scan's residual. The others' residual grows
     by less than a fifth from pass to pass: if none were joined, or those of a jump alone, the last would be more than twice
     the least."""
-    prior = prior_of("tv", priors.PriorInputs(rt, scan.grid, 5))
+    prior = kind_of("tv").make(priors.PriorInputs(rt, scan.grid, 5))
     algorithm = Fista(system, prior, PriorWeight(system, FrameError(0.01), 0.42), subsets=1000, nonnegative=True)
     assert len(algorithm.subsets) == scan.frames
     residuals = [algorithm.step() for _ in range(12)]
@@ -174,25 +174,25 @@ def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) 
 
 
 def test_a_ridge_step_follows_every_fourth_map_unless_a_volume_is_too_thin_and_resumes_between_them(rt, scan) -> None:
-    first, resumed, other = (prior_of("ridge", priors.PriorInputs(rt, scan.grid, 5)) for _ in range(3))
+    first, resumed, other = (kind_of("ridge").make(priors.PriorInputs(rt, scan.grid, 5)) for _ in range(3))
     pairs = zip(*(maps(prior, rt, scan.grid.shape, 4) for prior in (first, other.before)), strict=True)
     assert [np.array_equal(*pair) for pair in pairs] == [True] * 3 + [False]
     maps(first, rt, scan.grid.shape, 2)
     resumed.restore(first.state())
     np.testing.assert_array_equal(*(maps(prior, rt, scan.grid.shape, 3) for prior in (first, resumed)))
     inputs = priors.PriorInputs(rt, Grid((4, 12, 12), (0.1, 0.1, 0.1)), 5)
-    np.testing.assert_array_equal(*(maps(prior_of(name, inputs), rt, (4, 12, 12), 4) for name in ("dct", "ridge")))
+    np.testing.assert_array_equal(*(maps(kind_of(name).make(inputs), rt, (4, 12, 12), 4) for name in ("dct", "ridge")))
     share = priors.subvoxel_share
     assert share("ridge", (4, 12, 12)) == share("dct", (12, 12, 12)) < share("ridge", (5, 12, 12))
 
 
 def test_ridge_follows_the_maps_of_dct_on_a_fly_scan_and_less_total_variation_at_rest(rt, scan) -> None:
     inputs = priors.PriorInputs(rt, scan.grid, 5)
-    three = prior_of("dct", inputs), prior_of("ridge", replace(inputs, is_fly=True)), prior_of("ridge", inputs)
+    three = kind_of("dct").make(inputs), kind_of("ridge").make(replace(inputs, is_fly=True)), kind_of("ridge").make(inputs)
     dct, fly, still = (maps(prior, rt, scan.grid.shape)[0] for prior in three)
     np.testing.assert_array_equal(dct, fly)
     assert still.std() > 1.001 * dct.std(), (still.std(), dct.std())
-    noises = [prior_of("ridge", replace(inputs, noise=noise)) for noise in (0.001, 0.01, 0.1)]
+    noises = [kind_of("ridge").make(replace(inputs, noise=noise)) for noise in (0.001, 0.01, 0.1)]
     stds = [maps(prior, rt, scan.grid.shape)[0].std() for prior in noises]
     assert stds[0] > stds[1] > stds[2] > dct.std(), (stds, dct.std())
     scans = scan, replace(scan, is_fly=False)

@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Scan, Shutte
 from phyradgs_cl.api import reconstruct, static_scan
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import fdk_volume, weights
-from phyradgs_cl.reconstructors.fdk.views import view_arc
+from phyradgs_cl.reconstructors.fdk.arc import view_arc
 
 GRID = Grid((16, 32, 32), (0.0625,) * 3)
 PHANTOM = balls(((0.5, 0.1, 0.1), 0.28), ((-0.35, 0.4, -0.1), 0.25), ((-0.15, -0.5, 0), 0.25), ((0, 0, 0), 0.2))

@@ -24,35 +24,15 @@ from phyradgs_cl.operators import backproject, backproject_lines
 from phyradgs_cl.operators.warp.backproject import MovingBackprojector
 from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.prepare.step import unmasked_frames
-from phyradgs_cl.reconstructors.fdk import travel, weights
-from phyradgs_cl.reconstructors.fdk.frames import (
-    WAYS,
-    deblurred,
-    extended,
-    extrapolated,
-    reprojected,
-    whole_object,
-)
-from phyradgs_cl.reconstructors.fdk.views import (
-    Arc,
-    RayWeight,
-    check_beam,
-    filled_gap_rad,
-    opposite_weight,
-    pose_of_pixels,
-    ray_weight,
-    view_angles,
-    view_arc,
-    warn_if_incomplete,
-)
+from phyradgs_cl.reconstructors.fdk import travel
+from phyradgs_cl.reconstructors.fdk.frames import WAYS, deblurred, extrapolated, reprojected, whole_object
+from phyradgs_cl.reconstructors.fdk.views import RayWeight, Views, check_beam, ray_weight, warn_if_incomplete
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import without_warnings
 
 log = logging.getLogger(__name__)
-# Views share their ray weights if their poses, rotated back to one angle, differ by at most this fraction.
-_SAME_POSE = 1e-9
 _BLOCK_BYTES = 1 << 26  # frames are filtered in blocks of at most this many bytes, to limit memory
 _WORKERS = -1  # tells SciPy's Fourier transforms to use all cores
 
@@ -179,76 +159,50 @@ def fdk_volume(
     scans are recognised and weighted. whole: returns the complete object (nz, ny, nx) in 1/mm on ``grid``, which extrapolate
     ``reprojected`` needs. circle: sets voxels outside of the circle that the panel reaches to 0. moving: backprojects an
     object that moves. Logs a warning if data are missing. Raises InputError for a source on the rotation axis."""
-    by_pixel, canonical, fan, arc = _seen(pose, frames, axis, is_parallel)
-    if extrapolate != "none" and fan.is_put_aside:
-        log.warning("%s: the rows of a displaced detector are not extrapolated", "FBP" if is_parallel else "FDK")
+    views = Views(pose, frames.shape[1:], axis, is_parallel)
+    if extrapolate != "none" and views.fan.is_put_aside:
+        log.warning("%s: the rows of a displaced detector are not extrapolated", views.name)
     elif extrapolate != "none":
         if extrapolate == "reprojected" and whole is not None:
-            frames, count = reprojected(rt, frames, pose, axis, whole(), grid, is_parallel)
+            frames, count = reprojected(rt, frames, views, whole(), grid)
         else:
             frames, count = extrapolated(frames, extrapolate)
-        # from here on, frames and poses are those of a wider panel
-        pose, circle = extended(pose, axis, (count, count)), False
-        by_pixel, canonical, fan, arc = _seen(pose, frames, axis, is_parallel)
-    shape = (frames.shape[1], frames.shape[2])
-    warn_if_incomplete(arc, fan, canonical, grid, is_parallel)
+        views, circle = views.extended((count, count)), False  # from here on, the views have a wider panel
+    warn_if_incomplete(views, grid)
     # only a full turn has the opposite rays that complete a displaced detector
-    missing = fan.missing_columns if arc.is_full else (0, 0)
-    seen_mm = fan.half_rad if is_parallel else float(np.linalg.norm(canonical[0, 0, 0, :2]) * np.sin(fan.half_rad))
-    travels = travel.travels(by_pixel, shape[0], is_parallel)
-    ends = [] if travels or moving is not None else travel.ends(pose, shape[0], grid, seen_mm, is_parallel)
+    missing = views.fan.missing_columns if views.arc.is_full else (0, 0)
+    travels = travel.travels(views.middle, views.shape[0], is_parallel)
+    ends = [] if travels or moving is not None else travel.ends(views, grid)
     spare = 1 if ends else 0
-    filtered = _filtered(frames, ray_weight(canonical, shape, arc, fan, is_parallel), missing, window, spare)
-    pose, share = extended(pose, axis, missing), 0.5 * arc.gap_rad  # 0.5, because a full turn measures every ray twice
-    taller = extended(pose, axis, (spare, spare), "rows")
-    of_views = partial(_of_views, rt, taller, share, grid, axis, is_parallel, moving)
+    filtered = _filtered(frames, ray_weight(views), missing, window, spare)
+    wide, share = views.extended(missing), 0.5 * views.arc.gap_rad  # 0.5, because a full turn measures every ray twice
+    of_views = partial(_of_views, rt, wide.extended((spare, spare), "rows"), share, grid, moving)
     if travels:
-        counted = opposite_weight(canonical, shape, arc, is_parallel)
-        volume = travel.seen_volume(
-            filtered, pose, axis, grid, fan.is_displaced, is_parallel, counted, of_views, partial(of_views, power=1)
-        )
+        volume = travel.seen_volume(filtered, views, wide, grid, of_views)
     else:
         volume = of_views(filtered, np.arange(len(filtered)))
     if ends:
-        counted = opposite_weight(canonical[:, [canonical.shape[1] // 2]], (1, shape[1]), arc, is_parallel)  # of one row
-        weight = share * [np.mean(counted(view)) for view in range(len(filtered))]
-        travel.fill_ends(rt, volume, ends, pose, shape, weight, grid, is_parallel)
+        travel.fill_ends(rt, volume, ends, views, wide, share, grid)
     if circle:
         _, y_mm, x_mm = grid.axes_mm()
-        radius_mm = seen_mm + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # up to the outer edge of the last pixel
+        # up to the outer edge of the last pixel
+        radius_mm = views.seen_mm + np.linalg.norm(views.canonical[0, 0, 0, 6:9]) / 2
         volume[:, np.hypot(y_mm[:, None], x_mm) > radius_mm] = 0
     return volume
 
 
 def _of_views(
-    rt: Runtime, pose: np.ndarray, share: np.ndarray, grid: Grid, axis: str, is_parallel: bool,
-    moving: MovingBackprojector | None, images: np.ndarray, views: np.ndarray, power: int = 2,
+    rt: Runtime, views: Views, share: np.ndarray, grid: Grid, moving: MovingBackprojector | None,
+    images: np.ndarray, numbers: np.ndarray, power: int = 2,
 ) -> np.ndarray:  # fmt: skip
-    """Backprojects ``images`` (n, rows, columns) of the numbers ``views`` (n,), weighted by ``share`` (F,). Other arguments:
-    as in ``fdk_volume``. power: of the distance weight. With 1 a moving object counts as at rest."""
-    one, factor = pose[views], share[views]
+    """Backprojects ``images`` (n, rows, columns) of the views numbered ``numbers`` (n,), weighted by ``share`` (F,). power:
+    of the distance weight. With 1 a moving object, ``moving``, counts as at rest."""
+    pose, factor, axis, is_parallel = views.pose[numbers], share[numbers], views.axis, views.is_parallel
     if moving is not None and power == 2:
-        return moving.of_views(views)(images, one, factor, grid, axis, is_parallel=is_parallel)
+        return moving.of_views(numbers)(images, pose, factor, grid, axis, is_parallel=is_parallel)
     if pose.ndim == 2:
-        return backproject(rt, images, one, factor, grid, is_parallel=is_parallel, power=power)
-    return backproject_lines(rt, images, one, factor, grid, axis, is_parallel=is_parallel, power=power)
-
-
-def _seen(
-    pose: np.ndarray, frames: np.ndarray, axis: str, is_parallel: bool
-) -> tuple[np.ndarray, np.ndarray, weights.Fan, Arc]:
-    """Returns the poses as ``pose_of_pixels`` does, these poses rotated about z to one gantry angle, the fan that all views
-    see, and the arc that they cover. Raises InputError for a source on the rotation axis."""
-    by_pixel = pose_of_pixels(pose, axis)
-    if np.any(np.hypot(by_pixel[..., 0], by_pixel[..., 1]) <= 0):
-        raise InputError("poses", "a source on the rotation axis", "a source beside it")
-    angle_rad = view_angles(by_pixel)
-    canonical = travel.still_along_z(weights.turned_back(by_pixel, angle_rad), is_parallel)
-    # on a circular orbit all rotated poses are equal, so that one set of ray weights serves all views
-    if np.ptp(canonical, axis=0).max() <= _SAME_POSE * np.abs(canonical).max():
-        canonical = canonical[:1]
-    fan = weights.measured_fan(canonical, (frames.shape[1], frames.shape[2]), is_parallel)
-    return by_pixel, canonical, fan, view_arc(angle_rad, filled_gap_rad(fan))
+        return backproject(rt, images, pose, factor, grid, is_parallel=is_parallel, power=power)
+    return backproject_lines(rt, images, pose, factor, grid, axis, is_parallel=is_parallel, power=power)
 
 
 def _filtered(

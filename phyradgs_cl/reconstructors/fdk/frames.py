@@ -13,8 +13,6 @@ inverts: with H(f) = sinc(f Δθ) it multiplies by (1 + λ) H / (H² + λ), wher
 λ = 0, noise would grow without bound at the zeros of H. Rows that open later see the same box at other angles. A full turn
 is periodic; after half a turn the frames repeat, mirrored at the axis."""
 
-from dataclasses import replace
-
 import numpy as np
 import scipy
 
@@ -24,8 +22,10 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
+from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.operators.rays.subrays import subrays_of
-from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Report
+from phyradgs_cl.reconstructors.fdk.views import Views
+from phyradgs_cl.reconstructors.result import ProgressReport, labelled
 from phyradgs_cl.reconstructors.voxels import fista_tv
 from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions
 from phyradgs_cl.runtime import Runtime
@@ -37,18 +37,6 @@ _NOISE = 0.01  # a row that ends below this fraction of the line integrals' 99.9
 _UNEVEN = 0.02  # views are evenly spaced if no angular step differs from the median step by more than this fraction
 _REACH = 8  # the end views of an arc are repeated over this many times an exposure's arc, so that the filter meets no edge
 _FULL_TURN = 1.5  # if a gap is wider than this many median steps, the views cover less than a full turn
-
-
-def extended(pose: np.ndarray, axis: str, more: tuple[int, int], side: str = "columns") -> np.ndarray:
-    """Returns the poses (F, 12), or (F, lines, 12) along ``axis``, of frames with ``more`` (first, last) columns or rows at
-    their ends. side: "columns" or "rows"."""
-    if more == (0, 0):
-        return pose
-    if pose.ndim == 3 and axis == side:
-        pose = np.pad(pose, ((0, 0), more, (0, 0)), mode="edge")
-    moved = pose.copy()
-    moved[..., 3:6] -= more[0] * (pose[..., 6:9] if side == "columns" else pose[..., 9:12])
-    return moved
 
 
 def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
@@ -98,33 +86,24 @@ def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport
     """Returns a volume (nz, ny, nx) in 1/mm on the scan's grid that explains the scan's frames, by FISTA-TV.
 
     Raises KeyboardInterrupt when the user stops the run, because FDK has no checkpoints."""
-
-    def hook(progress: Progress) -> Progress:
-        return replace(progress, quantity=f"rows beyond the panel: {progress.quantity}", state=None)
-
     at_times: Motion = PerRow(sub_intervals=2) if isinstance(motion, LineMiddles) else motion
-    options, report = FistaTvOptions(motion=at_times, iterations=_ITERATIONS), Report.of(report)
-    with report.through(hook):
-        return fista_tv.METHOD.run(scan, options, rt, report=report).complete().volume
+    options = FistaTvOptions(motion=at_times, iterations=_ITERATIONS)
+    report = labelled("rows beyond the panel", report)
+    return fista_tv.METHOD.run(scan, options, rt, report=report).complete().volume
 
 
 def reprojected(
-    rt: Runtime, frames: np.ndarray, pose: np.ndarray, axis: str, volume: np.ndarray, grid: Grid,
-    is_parallel: bool = False,
+    rt: Runtime, frames: np.ndarray, views: Views, volume: np.ndarray, grid: Grid
 ) -> tuple[np.ndarray, int]:
-    """Continues line integrals ``frames`` (F, v, u) by projections of a volume. Returns (F, v, u + 2 n) float32, and n.
-
-    volume (nz, ny, nx) in 1/mm; pose (F, 12) or (F, lines, 12) in mm, with a pose for every line along ``axis``."""
-    rows, columns = frames.shape[1:]
-    count = _columns_beyond(pose.reshape(-1, 12), columns, grid, is_parallel)
-    wide = extended(pose, axis, (count, count))
-    by_line = wide[:, None] if wide.ndim == 2 else wide
-    shape = rows, columns + 2 * count
-    lines = shape[axis == "columns"]
-    tables = [_cells(poses, lines, axis, is_parallel) for poses in by_line]
-    operator = RayOperator(rt, grid, shape, tables, subrays=subrays_of(grid, tables))
+    """Continues line integrals ``frames`` (F, v, u) by projections of a ``volume`` (nz, ny, nx) in 1/mm on ``grid``. Returns
+    (F, v, u + 2 n) float32, and n."""
+    count = _columns_beyond(views, grid)
+    wide = views.extended((count, count))
+    lines, by_line = wide.shape[wide.axis == "columns"], wide.pose[:, None] if wide.pose.ndim == 2 else wide.pose
+    tables = [_cells(poses, lines, wide.axis, wide.is_parallel) for poses in by_line]
+    operator = RayOperator(rt, grid, wide.shape, tables, subrays=subrays_of(grid, tables))
     continued = operator.forward(np.ascontiguousarray(volume, np.float32))
-    continued[..., count : count + columns] = frames
+    continued[..., count : count + frames.shape[2]] = frames
     return continued, count
 
 
@@ -135,19 +114,13 @@ def _cells(pose: np.ndarray, lines: int, axis: str, is_parallel: bool) -> TimeCe
     return TimeCells(pose, 0 * weight, ends[:-1], ends[1:], weight, lines, axis, is_parallel=is_parallel)
 
 
-def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: bool) -> int:
-    """Returns how many columns each side needs so that panels of poses (n, 12) see the whole grid; at most two widths."""
-    source, first, step_u, step_v = (pose[:, None, i : i + 3] for i in (0, 3, 6, 9))
-    corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(1, 8, 3)
-    normal = np.cross(step_u, step_v)
-    if is_parallel:  # a pose then begins with the rays' direction, along which corners are projected
-        ahead = ((first - corners) * normal).sum(-1) / (source * normal).sum(-1)
-        hit = corners + ahead[..., None] * source - first
-    else:
-        depth = ((corners - source) * normal).sum(-1) / ((first - source) * normal).sum(-1)  # 1 in the panel's plane
-        hit = (corners - source) / np.maximum(depth, 1e-6)[..., None] - (first - source)
-    across = np.cross(step_v, normal)
-    column = (hit * across).sum(-1) / (step_u * across).sum(-1)
+def _columns_beyond(views: Views, grid: Grid) -> int:
+    """Returns how many columns each side needs so that panels of all poses see the whole grid; at most two widths."""
+    columns, sides = views.shape[1], [(-0.5, voxels - 0.5) for voxels in grid.shape[::-1]]
+    corners = np.stack([*np.meshgrid(*sides), np.ones((2, 2, 2))]).reshape(4, 8)
+    matrices = voxel_matrices(views.pose.reshape(-1, 12), grid, views.is_parallel).reshape(-1, 3, 4)
+    along_row, _, depth = np.moveaxis(matrices @ corners, 1, 0)  # the depth is 1 in the panel's plane
+    column = along_row / np.maximum(depth, 1e-6)
     beyond = max(-float(column.min()), float(column.max()) - (columns - 1))
     return int(np.clip(np.ceil(beyond), 0, round(_MOST * columns)))
 

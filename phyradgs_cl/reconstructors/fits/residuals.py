@@ -179,13 +179,14 @@ def vertex(at: np.ndarray, squares: np.ndarray) -> tuple[float, float]:
     resamplings or more have no minimum."""
     frames = squares.shape[1]
     draws = np.random.default_rng(0).integers(0, frames, (_DRAWS, frames))
-    drawn = np.array([_minimum(at, squares[:, draw].sum(1)) for draw in draws])
+    drawn = np.array([lowest(at, squares[:, draw].sum(1)) for draw in draws])
     finite = drawn[np.isfinite(drawn)]
     deviation = float(finite.std(ddof=1)) if finite.size > _DRAWS // 2 else float("nan")
-    return _minimum(at, squares.sum(1)), deviation
+    return lowest(at, squares.sum(1)), deviation
 
 
-def _minimum(at: np.ndarray, sums: np.ndarray) -> float:
+def lowest(at: np.ndarray, sums: np.ndarray) -> float:
+    """Returns where the parabola through three points has its minimum, at most 3 steps from the middle one; NaN without."""
     step = at[1] - at[0]
     curvature = sums[0] - 2 * sums[1] + sums[2]
     if curvature <= 0:

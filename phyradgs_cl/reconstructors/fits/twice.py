@@ -15,6 +15,7 @@ from phyradgs_cl.acquisition.altered.angles import azimuth_rad, middle_poses
 from phyradgs_cl.prepare.step import fill_masked
 from phyradgs_cl.reconstructors.fdk.weights import fan_angle, pixel_rays
 from phyradgs_cl.reconstructors.fits.axis import NOT_FOUND, SMOOTHING_PX, WIDEST_STEP_RAD, AxisShift
+from phyradgs_cl.reconstructors.fits.residuals import lowest
 
 _COARSE_COLUMNS = 128  # shifts are first tried on frames of at most this many columns
 _MOST_PX = 16.0  # largest shift of the panel that is tried, in coarse pixels: an eighth of the panel
@@ -130,5 +131,5 @@ def _minimum(places: np.ndarray, scores: np.ndarray) -> float:
     least = int(np.argmin(scores))
     if least in (0, len(scores) - 1):
         return math.nan
-    before, here, after = scores[least - 1 : least + 2]
-    return float(places[least] + _STEP_PX * (before - after) / (2 * (before - 2 * here + after)))
+    near = slice(least - 1, least + 2)
+    return lowest(places[near], scores[near])

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.sparse.linalg import LinearOperator, cg
 
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.time_cells import TimeCells
@@ -222,16 +223,6 @@ def sum_squares(values: np.ndarray) -> float:
 
 def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], right: np.ndarray, steps: int) -> np.ndarray:
     """Solves ``apply``(x) = ``right`` from x = 0 in ``steps`` steps, or fewer if ‖residual‖ falls to 1 % of ‖right‖."""
-    solution, residual = np.zeros_like(right), right.copy()
-    direction, squares = residual.copy(), sum_squares(residual)
-    least = 1e-4 * squares
-    for _ in range(steps):
-        if not squares > least:
-            break
-        applied = apply(direction)
-        share = squares / float(np.vdot(direction, applied))
-        solution += share * direction
-        residual -= share * applied
-        before, squares = squares, sum_squares(residual)
-        direction = residual + squares / before * direction
-    return solution
+    matrix = LinearOperator((right.size,) * 2, lambda x: apply(x.reshape(right.shape)).ravel(), dtype=right.dtype)
+    least = 0.01 * float(np.linalg.norm(right))  # absolute, because SciPy has renamed its relative tolerance
+    return cg(matrix, right.ravel(), atol=least, maxiter=steps)[0].reshape(right.shape)

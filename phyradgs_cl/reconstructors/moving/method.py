@@ -33,7 +33,7 @@ from phyradgs_cl.reconstructors.moving.signal import (
     motion_signal,
     signal_of,
 )
-from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress, Reconstruction, Report, option_facts
+from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress, Reconstruction, option_facts, through
 from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_stage, fista_stages
 from phyradgs_cl.reconstructors.voxels.run import MethodRun
 from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages
@@ -285,13 +285,11 @@ def moving(scan: Scan, options: MovingOptions, rt: Runtime, **arguments: Any) ->
     coarse, *fine = fista_stages(of_passes(), of_passes)
     # the first passes start as ``fista`` does, not from the volume of the search
     stages += [replace(coarse, make=lambda _: coarse.make(None)), *fine]
-    report = Report.of(run.report)
 
     def with_field(progress: Progress) -> Progress:
         return progress.mapped(state=lambda state: {**state, **one.state()}, deformation=one.for_passes)
 
-    with report.through(with_field):
-        result = replace(run, report=report).result("moving", Stages(stages, run))
+    result = replace(run, report=through(with_field, run.report)).result("moving", Stages(stages, run))
     state = None if result.state is None else {**result.state, **one.state()}
     facts = option_facts(replace(options, motion=of_passes().options.motion))
     result.facts.update(options=facts, **{MOTION_FOUND: _motion_facts(one, signal, scan)})

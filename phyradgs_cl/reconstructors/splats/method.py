@@ -18,6 +18,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Exact, Motion, Scan
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.checks import ceil_div
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Gaussians, Grid
 from phyradgs_cl.fields.gaussians import SCALE
 from phyradgs_cl.operators import voxelise
@@ -28,8 +29,8 @@ from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
 from phyradgs_cl.reconstructors.splats.options import PRESETS, R2_PUBLISHED, SplatOptions
-from phyradgs_cl.reconstructors.splats.start import box_of, first_population, internal_scale
-from phyradgs_cl.reconstructors.splats.step import Batch, DeviceCloud, FrameStep, Scale, sharing_of
+from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
+from phyradgs_cl.reconstructors.splats.step import Batch, DeviceCloud, FrameStep, Scale
 from phyradgs_cl.runtime import Runtime
 
 REPORT_EVERY = 50  # iterations between progress reports; lines of the convergence record are as far apart or closer
@@ -48,8 +49,7 @@ class SplatRun:
         self.rt, self.options, self.scale, self.rng = rt, options, scale, rng
         self.grid = scan.grid.scaled(1 / scale.length_mm)
         self.activation = options.activation(self.grid)
-        self.batch = options.batch_for(scan.frames, rt.ranks.size)
-        self.sharing = sharing_of(rt.ranks, self.batch)
+        self._take(options.batch_for(scan.frames, rt.ranks.size))
         self.frame_step = FrameStep(rt, scan, options, scale, self.grid, deformation)
         self.frames, self.adam = self.frame_step.frames, self.frame_step.adam
         self.iteration, self.iterations = 0, options.iterations
@@ -57,16 +57,28 @@ class SplatRun:
         self._queue: list[int] = []
         self.cloud = DeviceCloud(rt, population)
 
+    def _take(self, batch: int) -> None:
+        """Sets the number of frames of a step. Raises InputError if a rank has no frame of them."""
+        self.batch, ranks = batch, self.rt.ranks.size
+        if ranks > batch:
+            found, remedy = f"{batch} for {ranks} ranks", "raise it, or take fewer ranks"
+            raise InputError("batch", found, "a frame for every rank", remedy)
+
     def step(self) -> None:
         """Takes a step of Adam down the gradient of one batch of frames, then controls density if it is due."""
         options, before = self.options, self.iteration
         self.frame_step.follow(self.motion_at(before))
         batch = self.next_batch()
-        self.cloud.activate(self.adam)
-        self.sharing.differentiate(self.frame_step, self.cloud, batch)
+        cloud, stride = self.cloud, self.cloud.gaussians.stride
+        self.adam.activate(cloud.raw, cloud.gaussians.rows, cloud.count, stride)
+        if self.batch == 1:
+            self.frame_step.gradient(cloud, batch.frames[0], batch.corners[0], batch.late, cloud.statistics)
+        else:
+            self.frame_step.differentiate(cloud, batch)
         rates = options.rates.at(before / max(options.iterations, 1)) * np.sqrt(len(batch.frames))
         self.iteration += len(batch.frames)
-        self.cloud.move(self.adam, rates, ceil_div(self.iteration, self.batch))
+        self.adam.step(cloud.raw, cloud.gradients, cloud.moments, stride, rates, ceil_div(self.iteration, self.batch))
+        del cloud  # density control frees the arrays
         passed = range(before + 1, self.iteration + 1)
         if any(options.control.is_due(iteration, options.iterations) for iteration in passed):
             self.control_density()
@@ -96,13 +108,13 @@ class SplatRun:
         return Batch(frames, corners, late=self.iteration >= self.options.parameter_terms_from)
 
     def measures(self) -> dict[str, float]:
-        return {"loss": self.sharing.loss(self.frame_step), "gaussians": self.cloud.count}
+        return {"loss": self.frame_step.mean_loss(), "gaussians": self.cloud.count}
 
     def control_density(self) -> None:
         sums = self.cloud.read_statistics().astype(np.float64)
         begun = time.perf_counter()  # after the download, which waits for the device: only density control is timed
         statistic = sums[0] / np.maximum(sums[1], 1)
-        population, box = self.cloud.population(), box_of(self.grid)
+        population, box = self.cloud.population(), self.grid.box_mm[::-1].T
         self._load(control_density(population, statistic, self.activation, self.options.control, box, self.rng))
         self.control_seconds += time.perf_counter() - begun
         self.control_rounds += 1
@@ -122,8 +134,8 @@ class SplatRun:
 
     def restore(self, state: State) -> None:
         """Continues from ``state``. Raises InputError for more ranks than a batch has frames."""
-        self.iteration, self.batch = int(state["iteration"]), int(state["batch"])
-        self.sharing = sharing_of(self.rt.ranks, self.batch)
+        self.iteration = int(state["iteration"])
+        self._take(int(state["batch"]))
         self.rng.bit_generator.state = json.loads(str(state["rng"]))
         self._load(Population(state["raw"], state["moments"]))
         self.cloud.write_statistics(state["statistics"])
@@ -175,7 +187,7 @@ def reconstruct_splats(
     }  # fmt: skip
     if isinstance(options.motion, Exact):
         # frames may have different numbers of segments: the largest number is stated
-        facts |= {"segments": run.frames.most_cells, "motion_phases": run.phases()}
+        facts |= {"segments": max(cells.count for cells in run.frames.cells), "motion_phases": run.phases()}
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
     return Reconstruction(volume, scan.grid, cloud, loop.record, facts, loop.state_if_interrupted())
 

@@ -1,5 +1,6 @@
 """Options of the splatting methods, and their presets: ours and the paper's."""
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -72,8 +73,7 @@ class SplatOptions(MotionOptions):
         """Returns the number of Gaussians at the start: the option or, for 0, 1/16 of the voxels, from 1,000 to 50,000."""
         if self.gaussians:
             return self.gaussians
-        voxels = grid.shape[0] * grid.shape[1] * grid.shape[2]
-        return int(min(max(voxels / 16, 1000), 50_000))
+        return int(min(max(math.prod(grid.shape) / 16, 1000), 50_000))
 
     def motion_at(self, share: float) -> Motion:
         """Returns the motion model after the fraction ``share`` of the run. In place of ``exact`` it is a coarser one before

@@ -41,7 +41,7 @@ def first_population(
             requested, cloud.count, cloud.count,
         )  # fmt: skip
     raw = activation.invert(cloud.rows())
-    return prune(Population(raw, np.zeros((2, *raw.shape))), activation, options.control, box_of(grid))
+    return prune(Population(raw, np.zeros((2, *raw.shape))), activation, options.control, grid.box_mm[::-1].T)
 
 
 def initial_cloud(
@@ -77,10 +77,3 @@ def neighbour_distance(points: np.ndarray, fallback: float) -> np.ndarray:
         return np.full(len(points), fallback)
     distance, _ = scipy.spatial.cKDTree(points).query(points, k=neighbours)
     return np.sqrt((distance[:, 1:] ** 2).mean(axis=1))
-
-
-def box_of(grid: Grid) -> np.ndarray:
-    """Returns the lowest and the highest corner (2, 3) of a grid, x y z, in the grid's unit of length."""
-    half = np.array(grid.size_mm[::-1]) / 2
-    centre = np.array(grid.offset_mm[::-1])
-    return np.stack([centre - half, centre + half])

@@ -10,7 +10,6 @@ from functools import partial
 import numpy as np
 
 from phyradgs_cl.acquisition import Exact, Motion, Scan, TimeCells
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.objective import ImageLoss, TotalVariation
 from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector, Voxeliser
@@ -18,7 +17,7 @@ from phyradgs_cl.operators.splats.layout import pad_columns, stride_of
 from phyradgs_cl.operators.splats.projector import DEFAULT_TIME_ERROR
 from phyradgs_cl.operators.splats.states import CloudStates, segments_for_object, states_of
 from phyradgs_cl.optim import DeviceAdam, Population
-from phyradgs_cl.parallel import Communicator, exact_sum
+from phyradgs_cl.parallel import exact_sum
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import pad_rows
@@ -59,13 +58,6 @@ class DeviceCloud:
         self.statistics = rt.zeros((2, stride))
         self.gaussians = DeviceGaussians(rt.zeros((_ROWS, stride)), self.count, stride)
 
-    def activate(self, adam: DeviceAdam) -> None:
-        adam.activate(self.raw, self.gaussians.rows, self.count, self.gaussians.stride)
-
-    def move(self, adam: DeviceAdam, rates: np.ndarray, step: int) -> None:
-        """Takes a step of Adam down the gradients. rates (11,): learning rates of the parameters; step: counts from 1."""
-        adam.step(self.raw, self.gradients, self.moments, self.gaussians.stride, rates, step)
-
     def population(self) -> Population:
         count = self.count
         return Population(self.rt.download(self.raw)[:, :count], self.rt.download(self.moments)[:, :, :count])
@@ -95,7 +87,10 @@ class DeviceFrames:
         self.intensity_unit = scale.line_integral if self.follow(options.motion) else None
         measured = (frame / np.float32(scale.line_integral) for frame in scan.projections)
         self._measured = [rt.upload(pad_rows(readout.frames(m))) for m in measured]
-        self._mask, self._pixels = _upload_masks(rt, scan)
+        masks = np.zeros((1, *scan.geometry.detector_shape)) if scan.pixel_mask is None else scan.pixel_mask
+        usable = [(m == 0).astype(np.float32) for m in (masks if masks.ndim == 3 else masks[None])]  # one, or one per frame
+        self._mask = [rt.upload(pad_rows(readout.frames(m))) for m in usable]
+        self._pixels = [float(m.sum()) for m in usable]
 
     def follow(self, motion: Motion) -> bool:
         """Uploads the time cells of a motion model. Returns whether frames are averages of intensity over a line's cells."""
@@ -103,17 +98,13 @@ class DeviceFrames:
         of_object = self.deformation
         states = [None if of_object is None else states_of(table, of_object) for table in tables]
         scaled = (table.scaled(1 / self.scale.length_mm) for table in tables)
-        self._cells = [DeviceCells.upload(self.rt, table, own) for table, own in zip(scaled, states, strict=True)]
+        self.cells = [DeviceCells.upload(self.rt, table, own) for table, own in zip(scaled, states, strict=True)]
         return merges
-
-    @property
-    def most_cells(self) -> int:
-        return max(cells.count for cells in self._cells)
 
     def get(self, frame: int) -> tuple[DeviceCells, DeviceArray, DeviceArray, float]:
         """Returns the time cells, measurement, mask (1 at valid pixels) and number of valid pixels of frame ``frame``."""
         mask = frame if len(self._mask) > 1 else 0
-        return self._cells[frame], self._measured[frame], self._mask[mask], self._pixels[mask]
+        return self.cells[frame], self._measured[frame], self._mask[mask], self._pixels[mask]
 
 
 def tables_of(
@@ -133,14 +124,6 @@ def tables_of(
                 tables[frame] = replace(motion, segments=needed).cells(scan, frame)
     # for lines with a single time, the log model and the intensity model agree
     return tables, model == "intensity" and any(table.averages for table in tables)
-
-
-def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[float]]:
-    """Uploads one mask for all frames, or one per frame: 1 at valid pixels. Returns masks and numbers of valid pixels."""
-    masks = np.zeros((1, *scan.geometry.detector_shape)) if scan.pixel_mask is None else scan.pixel_mask
-    stack = [(m == 0).astype(np.float32) for m in (masks if masks.ndim == 3 else masks[None])]
-    arrays = [rt.upload(pad_rows(scan.shutter.readout.frames(m))) for m in stack]
-    return arrays, [float(m.sum()) for m in stack]
 
 
 @dataclass(frozen=True)
@@ -178,6 +161,7 @@ class FrameStep:
         self.crop = Voxeliser(rt, (z, y, x), cutoff_sigma=options.cutoff_sigma)
         self.tv = TotalVariation(rt, self.crop.shape, self.crop.pitch)
         self.adam = DeviceAdam(rt, options.activation(grid))
+        self._losses: np.ndarray | None = None
 
     def follow(self, motion: Motion) -> None:
         """Makes later steps render frames with the motion model ``motion``."""
@@ -193,6 +177,29 @@ class FrameStep:
         room = (n - edge + 1 for n, edge in zip(self.grid.shape, self.crop.shape, strict=True))
         z, y, x = (int(rng.integers(n)) for n in room)
         return z, y, x
+
+    def differentiate(self, cloud: DeviceCloud, batch: Batch) -> None:
+        """Writes dL/d(raw parameters) of a batch of several frames into the cloud's gradients, and adds to its statistics.
+        Rank r takes frames r, r + ranks, … of the batch."""
+        rt, stride, count = self.rt, cloud.gaussians.stride, len(batch.frames)
+        self._losses, own = np.zeros(count), []
+        for place in range(rt.ranks.rank, count, rt.ranks.size):
+            statistics = rt.zeros((_STATISTICS, stride))
+            self.gradient(cloud, batch.frames[place], batch.corners[place], batch.late, statistics)
+            self._losses[place] = self.loss.value()
+            own.append(np.concatenate([rt.download(cloud.gradients)[:_ROWS], rt.download(statistics)]))
+        total = exact_sum(rt.ranks, own, (_ROWS + _STATISTICS, stride), count)
+        # the rows of dL/d(projected centre) are set to 0: the statistics contain them already
+        rt.write(cloud.gradients, np.pad(total[:_ROWS], ((0, _DERIVED - _ROWS), (0, 0))))
+        rt.write(cloud.statistics, rt.download(cloud.statistics) + total[_ROWS:])
+
+    def mean_loss(self) -> float:
+        """Returns the mean loss of the last batch's frames; of one frame, if ``differentiate`` was not called."""
+        if self._losses is None:
+            return self.loss.value()
+        losses = self._losses.copy()
+        self.rt.ranks.allreduce_sum(losses)
+        return float(losses.mean())
 
     def gradient(
         self, cloud: DeviceCloud, frame: int, corner: Corner | None, late: bool, statistics: DeviceArray
@@ -210,49 +217,3 @@ class FrameStep:
             self.crop.backward(gaussians, self.grid, by_volume, by_cloud, add=True, weight=options.tv_weight)
         own = cloud.raw, gaussians.rows, by_cloud, statistics, cloud.count, gaussians.stride
         self.adam.chain(*own, density_weight=options.density_weight if late else 0.0)
-
-
-class Alone:
-    """The gradient and the loss of steps that take one frame, in one process."""
-
-    def differentiate(self, step: FrameStep, cloud: DeviceCloud, batch: Batch) -> None:
-        """Writes dL/d(raw parameters) of the batch into the cloud's gradients, and adds to its statistics."""
-        step.gradient(cloud, batch.frames[0], batch.corners[0], batch.late, cloud.statistics)
-
-    def loss(self, step: FrameStep) -> float:
-        return step.loss.value()
-
-
-class SharedFrames(Alone):
-    """The gradient and the loss of steps that take several frames: rank r takes frames r, r + ranks, … of the batch."""
-
-    def __init__(self, ranks: Communicator) -> None:
-        self.ranks = ranks
-        self._losses = np.zeros(1)
-
-    def differentiate(self, step: FrameStep, cloud: DeviceCloud, batch: Batch) -> None:
-        rt, stride, count = step.rt, cloud.gaussians.stride, len(batch.frames)
-        self._losses = np.zeros(count)
-        own = []
-        for place in range(self.ranks.rank, count, self.ranks.size):
-            statistics = rt.zeros((_STATISTICS, stride))
-            step.gradient(cloud, batch.frames[place], batch.corners[place], batch.late, statistics)
-            self._losses[place] = step.loss.value()
-            own.append(np.concatenate([rt.download(cloud.gradients)[:_ROWS], rt.download(statistics)]))
-        total = exact_sum(self.ranks, own, (_ROWS + _STATISTICS, stride), count)
-        # the rows of dL/d(projected centre) are set to 0: the statistics contain them already
-        rt.write(cloud.gradients, np.pad(total[:_ROWS], ((0, _DERIVED - _ROWS), (0, 0))))
-        rt.write(cloud.statistics, rt.download(cloud.statistics) + total[_ROWS:])
-
-    def loss(self, step: FrameStep) -> float:
-        losses = self._losses.copy()
-        self.ranks.allreduce_sum(losses)
-        return float(losses.mean())
-
-
-def sharing_of(ranks: Communicator, batch: int) -> Alone:
-    """Returns the object that computes steps of ``batch`` frames on ``ranks``. Raises InputError if a rank has no frame."""
-    if ranks.size > batch:
-        found = f"{batch} for {ranks.size} ranks"
-        raise InputError("batch", found, "a frame for every rank", "raise it, or take fewer ranks")
-    return SharedFrames(ranks) if batch > 1 else Alone()

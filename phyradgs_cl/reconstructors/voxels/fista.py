@@ -316,7 +316,7 @@ def fista_stage(
     prior_inputs = priors.PriorInputs(
         rt, scan.grid, options.tv_iterations, image, options.prior_share, scan.is_fly, error.noise
     )
-    prior = priors.prior_of(options.prior, prior_inputs)
+    prior = priors.kind_of(options.prior).make(prior_inputs)
     with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):
         weight = PriorWeight(system, error, options.prior_weight)
         subsets, passes = options.subsets, 1

@@ -8,7 +8,7 @@ import math
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -136,8 +136,8 @@ class PriorInputs:
     is_fly: bool = False
     noise: float = _USUAL_NOISE
 
-    def tv(self, share: float = 1.0) -> "TvPrior":
-        return TvPrior(TvProx(self.rt, self.grid.shape, axis_weights(self.grid)), self.tv_iterations, share)
+    def tv(self, share: float = 1.0, name: str = "dual") -> "TvPrior":
+        return TvPrior(TvProx(self.rt, self.grid.shape, axis_weights(self.grid)), self.tv_iterations, share, name)
 
     def tv_and_dct(self, tv_share: float = _TV_BEFORE_DCT, dct_share: float = _DCT) -> "TvAndDct":
         return TvAndDct(self.tv(tv_share), DctProx(self.rt, self.grid.shape), dct_share)
@@ -160,8 +160,11 @@ class PriorInputs:
 class Prior:
     """A proximal map, from x to argmin over x' of ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or an approximation of it.
 
-    A subclass that needs arrays of its last call keeps these in ``state``. This class is the prior ``none``, with R = 0."""
+    A subclass that needs numbers of its last call lists them in ``NUMBERS``; one that consists of other priors lists these
+    in ``parts``. This class is the prior ``none``, with R = 0."""
 
+    NUMBERS: ClassVar[tuple[str, ...]] = ()
+    parts: tuple["Prior", ...] = ()
     noise_share = 1.0
     """Fraction, 0 to 1, of this pass's weight that is due to noise; the rest is due to the discretisation of edges."""
 
@@ -171,27 +174,32 @@ class Prior:
         return space.add(volume, volume, 0.0, nonnegative=nonnegative)
 
     def state(self) -> dict[str, np.ndarray]:
-        return {}
+        own = {name: np.array(getattr(self, name)) for name in self.NUMBERS}
+        return {name: array for one in (*(part.state() for part in self.parts), own) for name, array in one.items()}
 
     def restore(self, state: State) -> None:
         """Continues from the arrays that ``state`` returned."""
+        for part in self.parts:
+            part.restore(state)
+        for name in self.NUMBERS:
+            setattr(self, name, state[name].item())
 
 
 class TvPrior(Prior):
-    """The prior tv: isotropic total variation, weighted by ``share`` times the prior's weight."""
+    """The prior tv: isotropic total variation, weighted by ``share`` times the prior's weight. name: its dual in states."""
 
-    def __init__(self, prox: TvProx, iterations: int, share: float = 1.0) -> None:
-        self.prox, self.iterations, self.share = prox, iterations, share
+    def __init__(self, prox: TvProx, iterations: int, share: float = 1.0, name: str = "dual") -> None:
+        self.prox, self.iterations, self.share, self.name = prox, iterations, share, name
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         out = space.place(self.prox.shape)
         return self.prox(volume, self.share * weight, self.iterations, nonnegative=nonnegative, out=out)
 
     def state(self) -> dict[str, np.ndarray]:
-        return {"dual": self.prox.dual}
+        return {self.name: self.prox.dual}
 
     def restore(self, state: State) -> None:
-        self.prox.dual = state["dual"]
+        self.prox.dual = state[self.name]
 
 
 class TvAndDct(Prior):
@@ -199,8 +207,11 @@ class TvAndDct(Prior):
 
     share: (threshold of the shrinkage)/(weight of the prior)."""
 
+    NUMBERS = ("turn",)
+
     def __init__(self, tv: TvPrior, shrink: DctProx, share: float) -> None:
         self.tv, self.shrink, self.share, self.turn = tv, shrink, share, 0
+        self.parts = (tv,)
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         smooth = self.tv(space, volume, weight, nonnegative=nonnegative)
@@ -209,20 +220,16 @@ class TvAndDct(Prior):
         self.turn = (turn + 1) % len(TURNS)
         return self.shrink(smooth, self.share * weight, turn, nonnegative=nonnegative, out=out)
 
-    def state(self) -> dict[str, np.ndarray]:
-        return {**self.tv.state(), "turn": np.array(self.turn)}
-
-    def restore(self, state: State) -> None:
-        self.tv.restore(state)
-        self.turn = int(state["turn"])
-
 
 class ThenRidge(Prior):
     """The prior ridge: the map of the prior ``before`` and, after every fourth map, a step down the ridge regulariser."""
 
+    NUMBERS = ("maps",)
+
     def __init__(self, before: Prior, ridge: RidgeStep, noise_factor: float) -> None:
         """Joins both maps. noise_factor: (noise that the ridge step assumes)/(part of the weight that is due to noise)."""
         self.before, self.ridge, self.noise_factor = before, ridge, noise_factor
+        self.parts = (before,)
         self.maps = 0  # number of maps since the last ridge step
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
@@ -235,13 +242,6 @@ class ThenRidge(Prior):
         out = space.place(self.ridge.shape)
         return self.ridge(volume, sigma=sigma, step=_RIDGE_LENGTH, nonnegative=nonnegative, out=out)
 
-    def state(self) -> dict[str, np.ndarray]:
-        return {**self.before.state(), "maps": np.array(self.maps)}
-
-    def restore(self, state: State) -> None:
-        self.before.restore(state)
-        self.maps = int(state["maps"])
-
 
 class Piccs(Prior):
     """The prior piccs: (1 − share) TV(x) + share TV(x − image), as the map of the first term and then of the second.
@@ -251,7 +251,7 @@ class Piccs(Prior):
     def __init__(self, inputs: PriorInputs) -> None:
         if inputs.image is None:
             raise InputError("--prior piccs", "no prior image", "a volume to start from", "say --initial, or take tv")
-        self.plain, self.change = inputs.tv(), inputs.tv()
+        self.parts = self.plain, self.change = inputs.tv(), inputs.tv(name="dual_of_change")
         self.image, self.share = inputs.image, inputs.share
         self._image_in_space: Any = None
 
@@ -264,13 +264,6 @@ class Piccs(Prior):
         change = self.change(space, change, self.share * weight, nonnegative=False)
         return space.add(change, self._image_in_space, 1.0, nonnegative=nonnegative)
 
-    def state(self) -> dict[str, np.ndarray]:
-        return {**self.plain.state(), "dual_of_change": self.change.prox.dual}
-
-    def restore(self, state: State) -> None:
-        self.plain.restore(state)
-        self.change.prox.dual = state["dual_of_change"]
-
 
 Denoiser = Callable[[np.ndarray, float], np.ndarray]
 """A user's own prior (plug-and-play): from a volume (nz, ny, nx) float32 and its noise, both in 1/mm, to a volume."""
@@ -278,10 +271,15 @@ Denoiser = Callable[[np.ndarray, float], np.ndarray]
 
 class OwnPrior(Prior):
     """A user's denoiser, a function on the host, in place of a proximal map (plug-and-play: Venkatakrishnan et al. 2013).
-    The denoiser gets small weights, and must remove less noise the smaller the weight is."""
+    The denoiser gets small weights, and must remove less noise the smaller the weight is.
 
-    def __init__(self, denoiser: Denoiser) -> None:
-        self.denoiser, self.subject = denoiser, f"--prior {function_name(denoiser)}"
+    denoiser: the function, or its ``package.module:function``. Raises InputError for what is no function."""
+
+    def __init__(self, denoiser: str | Denoiser) -> None:
+        own = imported(denoiser, "--prior") if isinstance(denoiser, str) else denoiser
+        if not callable(own):
+            raise InputError("--prior", checks.short_repr(own), "a function (volume, noise)")
+        self.denoiser, self.subject = own, f"--prior {function_name(own)}"
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         noisy = space.numpy(volume)
@@ -315,21 +313,9 @@ PRIORS = {
 }
 
 
-def prior_of(prior: str | Denoiser, inputs: PriorInputs) -> Prior:
-    """Returns a prior by its name in ``PRIORS``, or from a user's function, given as such or as ``package.module:function``.
-
-    Raises InputError for what is neither a name nor a function, and for piccs without an image."""
-    if isinstance(prior, str) and prior in PRIORS:
-        return PRIORS[prior].make(inputs)
-    own = imported(prior, "--prior") if isinstance(prior, str) else prior
-    if not callable(own):
-        raise InputError("--prior", checks.short_repr(own), "a function (volume, noise)")
-    return OwnPrior(own)
-
-
 def kind_of(prior: str | Denoiser) -> PriorKind:
     """Returns a prior's entry in ``PRIORS``; for a user's function or its name, a new entry without further volumes."""
-    own = PriorKind(lambda inputs: prior_of(prior, inputs))
+    own = PriorKind(lambda inputs: OwnPrior(prior))
     return PRIORS.get(prior, own) if isinstance(prior, str) else own
 
 

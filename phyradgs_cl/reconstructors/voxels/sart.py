@@ -4,17 +4,17 @@ SIRT: Gilbert, J. Theor. Biol. 36 (1972) 105. SART: Andersen and Kak, Ultrasonic
 Jiang, J. X-Ray Sci. Technol. 12 (2004) 169."""
 
 import math
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.checks import ranged
-from phyradgs_cl.reconstructors.method import Method
-from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, voxel_method
+from phyradgs_cl.reconstructors.checkpoint import State
+from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, MethodRun, voxel_method
 from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights, spread_order
 
 _WEIGHT_CACHE_BYTES = 1 << 29  # most bytes of column weights in memory; those of further subsets are computed in every pass
@@ -38,21 +38,32 @@ class SartOptions(IterativeOptions):
 OS_SART = SartOptions(frames_per_subset=10)
 
 
+@dataclass(frozen=True)
+class SirtOptions(IterativeOptions):
+    """Options of SIRT. relaxation: λ, the factor on each correction, up to 2."""
+
+    frames_per_subset: ClassVar[int] = sys.maxsize  # all
+    relaxation_reduction: ClassVar[float] = 1.0
+
+    iterations: int = 100
+    relaxation: float = checks.ranged(1.0, 1e-6, 2)
+
+
 class Sart(Algorithm):
     """SART, x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i of the frames, with the rays' W = 1/(Aᵢ 1) and the voxels' V =
-    1/(Aᵢᵀ 1).
+    1/(Aᵢᵀ 1). With one subset of all frames this is SIRT, whose residual, weighted by √W, never grows in the log model.
 
     The intensity model replaces Aᵢ x by the expected Iᵢ(x), and Aᵢᵀ by Jᵢᵀ, with the derivative Jᵢ of Iᵢ. An iteration's
     residual combines those of all subsets, each before its correction."""
 
     NUMBERS = ("relaxation",)
 
-    def __init__(self, system: System, options: SartOptions) -> None:
+    def __init__(self, system: System, options: SartOptions | SirtOptions) -> None:
         super().__init__(system)
         self.options, self.relaxation = options, options.relaxation
-        order = spread_order(system.frames)
-        size = options.frames_per_subset
-        self.subsets = [system.subset(order[i : i + size]) for i in range(0, len(order), size)]
+        order, size = spread_order(system.frames), options.frames_per_subset
+        starts = range(0, len(order), size) if size < len(order) else ()
+        self.subsets = [system.subset(order[i : i + size]) for i in starts] or [system]
         self._row_weights = [row_weights(subset) for subset in self.subsets]
         cached = self.subsets[: _cached_columns(system.volume_shape, len(self.subsets))]
         self._column_weights = [column_weights(subset) for subset in cached]
@@ -61,6 +72,9 @@ class Sart(Algorithm):
         squares = self.system.space.sum_squares(self._corrections())
         self.relaxation *= self.options.relaxation_reduction
         return float(np.sqrt(squares))
+
+    def restore(self, state: State) -> None:
+        super().restore({"relaxation": np.array(self.relaxation), **state})  # earlier versions' states of SIRT lack it
 
     def _corrections(self) -> Iterator[Any]:
         """Corrects the volume with each subset in turn. Yields the subset's residual just before its correction."""
@@ -88,40 +102,10 @@ def held_volumes(scan: Scan, options: SartOptions) -> int:
     return 4 + _cached_columns(scan.grid.shape, checks.ceil_div(scan.frames, options.frames_per_subset))
 
 
-def _method(name: str, default: SartOptions) -> Method:
-    return voxel_method(name, default, lambda system, options, _: Sart(system, options), volumes=held_volumes, frames=2)
+def _sart(system: System, options: "SartOptions | SirtOptions", run: MethodRun) -> Sart:
+    return Sart(system, options)
 
 
-METHOD, OS_METHOD = _method("sart", SartOptions()), _method("os-sart", OS_SART)
-
-
-@dataclass(frozen=True)
-class SirtOptions(IterativeOptions):
-    """Options of SIRT. relaxation: λ, the factor on each correction, up to 2."""
-
-    iterations: int = 100
-    relaxation: float = ranged(1.0, 1e-6, 2)
-
-
-class Sirt(Algorithm):
-    """SIRT, x ← x + λ C Aᵀ R (p − A x), with R = 1/(A 1) and C = 1/(Aᵀ 1). The intensity model replaces A x by the expected
-    I(x), and Aᵀ by Jᵀ, with the derivative J of I.
-
-    An iteration's residual is the one before its correction. Weighted by √R, its norm never grows in the log model."""
-
-    def __init__(self, system: System, options: SirtOptions) -> None:
-        super().__init__(system)
-        self.options = options
-        self._rows, self._columns = row_weights(system), column_weights(system)
-
-    def step(self) -> float:
-        space, options = self.system.space, self.options
-        residual = self.system.residual(self.volume)
-        update = self.system.back(space.multiply(residual, self._rows))
-        self.volume = space.add_product(
-            self.volume, self._columns, update, options.relaxation, nonnegative=options.nonnegative
-        )
-        return space.norm(residual)
-
-
-SIRT_METHOD = voxel_method("sirt", SirtOptions(), lambda system, options, _: Sirt(system, options), volumes=4, frames=1)
+METHOD = voxel_method("sart", SartOptions(), _sart, volumes=held_volumes, frames=2)
+OS_METHOD = voxel_method("os-sart", OS_SART, _sart, volumes=held_volumes, frames=2)
+SIRT_METHOD = voxel_method("sirt", SirtOptions(), _sart, volumes=4, frames=1)

@@ -7,7 +7,7 @@ import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +27,6 @@ log = logging.getLogger(__name__)
 _SHORTEST_PATH = 0.1  # a ray's path counts as at least this fraction of the longest: division by less amplifies noise
 _FAINTEST = 1e-6  # the sum of path lengths in a voxel that rays meet counts as at least this fraction of the largest sum
 _GROWTH = 1.2  # steps count as diverging if a pass's residual exceeds this many times the least residual of earlier passes
-S = TypeVar("S", bound="SharedOperator")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +45,7 @@ class System:
     operator: LinearOperator
     measured: Any
     valid: Any = None
-    intensity: "IntensityOperator | SharedIntensity | None" = None
+    intensity: "IntensityOperator | SharedOperator | None" = None
     transmission: Any = None
     space: Space[Any] = HostSpace()
 
@@ -69,13 +68,13 @@ class System:
         operator: LinearOperator = projector(rt, scan.grid, shape, tables, subrays=subrays, **lines)
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
-        intensity: IntensityOperator | SharedIntensity | None = None
+        intensity: IntensityOperator | SharedOperator | None = None
         # if every line has a single time, the detector models log and intensity are the same
         if model == "intensity" and any(table.averages for table in tables):
-            alone = IntensityOperator(rt, scan.grid, shape, tables, projector, subrays)
-            intensity = SharedIntensity(rt.ranks, alone) if rt.ranks.size > 1 else alone
+            intensity = IntensityOperator(rt, scan.grid, shape, tables, projector, subrays)
         if rt.ranks.size > 1:
             operator = SharedOperator(rt.ranks, operator)
+            intensity = None if intensity is None else SharedOperator(rt.ranks, intensity)
         if scan.pixel_mask is None:
             return cls(operator, measured, None, intensity)
         valid = np.asarray(scan.pixel_mask == 0)
@@ -133,7 +132,11 @@ class System:
 
     def forward(self, volume: Any) -> Any:
         """Returns the projections A x (F, rows, columns), 0 at invalid pixels."""
-        return self.masked(self.operator.forward(volume, self.space.place(self.operator.frames_shape)))
+        return self._frames(self.operator.forward, volume)
+
+    def _frames(self, function: Callable[..., Any], volume: Any) -> Any:
+        # the frames before masking get no name, because a name would keep their memory in use
+        return self.masked(function(volume, self.space.place(self.operator.frames_shape)))
 
     def adjoint(self, frames: Any) -> Any:
         """Returns the backprojection Aᵀ y (nz, ny, nx) of frames y that are 0 at invalid pixels."""
@@ -141,28 +144,20 @@ class System:
 
     def expected(self, volume: Any) -> Any:
         """Returns the expected measurement of x: A x or, in the intensity model, I(x); 0 at invalid pixels."""
-        return self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
-
-    @property
-    def _model(self) -> Callable[..., Any]:
-        return self.operator.forward if self.intensity is None else self.intensity.expected
+        return self._frames(self.operator.forward if self.intensity is None else self.intensity.expected, volume)
 
     def derivative(self, change: Any) -> Any:
         """Returns the linear change of ``expected`` for a change d of its last volume: A d or, in the intensity model, with
         the Jacobian J of I at that volume, J d; 0 at invalid pixels."""
-        operator = self.operator if self.intensity is None else self.intensity
-        return self.masked(operator.forward(change, self.space.place(self.operator.frames_shape)))
+        return self._frames((self.intensity or self.operator).forward, change)
 
     def back(self, frames: Any) -> Any:
         """Returns the transpose of ``derivative``, Aᵀ y or Jᵀ y (nz, ny, nx), for frames y that are 0 at invalid pixels."""
-        operator = self.operator if self.intensity is None else self.intensity
-        return operator.adjoint(frames, self.space.place(self.volume_shape))
+        return (self.intensity or self.operator).adjoint(frames, self.space.place(self.volume_shape))
 
     def residual(self, volume: Any) -> Any:
         """Returns the residual p − A x or, in the intensity model, p − I(x), dimensionless; 0 at invalid pixels."""
-        # the frames before masking get no name, because a name would keep their memory in use
-        expected = self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
-        return self.space.add(self.measured, expected, -1.0)
+        return self.space.add(self.measured, self.expected(volume), -1.0)
 
     def noise_norm(self) -> float:
         """Returns the norm of the measurement's noise over the valid pixels, estimated from the measurement."""
@@ -248,12 +243,12 @@ class OrderedSubsets:
 
 
 class SharedOperator:
-    """A ``LinearOperator`` whose frames the ranks divide among them; ``whole`` is the operator of all frames.
+    """A ``LinearOperator`` whose frames the ranks divide among them; ``whole``, another, is that of all frames.
 
     Volumes and frames are complete on every rank, so that methods do the same on each rank. The bits of a sum of volumes do
     not depend on the order of the ranks, only on which frames each rank projects."""
 
-    def __init__(self, ranks: Communicator, whole: LinearOperator) -> None:
+    def __init__(self, ranks: Communicator, whole: Any) -> None:
         self.ranks, self.whole = ranks, whole
         self.volume_shape, self.frames_shape = whole.volume_shape, whole.frames_shape
         run = span(self.frames_shape[0], ranks.size, ranks.rank)
@@ -270,22 +265,15 @@ class SharedOperator:
         parts = [] if self._part is None else [self._part.adjoint(frames[self._own]).reshape(shape)]
         return exact_sum(self.ranks, parts, shape, self.ranks.size).reshape(self.volume_shape)
 
-    def subset(self: S, frames: Sequence[int]) -> S:
+    def expected(self, volume: np.ndarray, out: None = None) -> np.ndarray:
+        """Returns the expected measurement I(x), (F, rows, columns) float32, of a volume x (nz, ny, nx) in 1/mm, if
+        ``whole`` is an ``IntensityOperator``. From then on J is the derivative at x."""
+        return self._gathered(None if self._part is None else self._part.expected(volume))
+
+    def subset(self, frames: Sequence[int]) -> "SharedOperator":
         """Returns the operator of the frames with the numbers ``frames``, in this order, divided among the ranks again."""
-        return type(self)(self.ranks, self.whole.subset(frames))
+        return SharedOperator(self.ranks, self.whole.subset(frames))
 
     def _gathered(self, part: np.ndarray | None) -> np.ndarray:
         no_frames = np.zeros((0, *self.frames_shape[1:]), np.float32)
         return self.ranks.allgather(no_frames if part is None else part)
-
-
-class SharedIntensity(SharedOperator):
-    """An ``IntensityOperator`` whose frames the ranks divide among them."""
-
-    whole: IntensityOperator
-    _part: IntensityOperator | None
-
-    def expected(self, volume: np.ndarray, out: None = None) -> np.ndarray:
-        """Returns the expected measurement I(x), (F, rows, columns) float32, of a volume x (nz, ny, nx) in 1/mm. From then
-        on J is the derivative at x."""
-        return self._gathered(None if self._part is None else self._part.expected(volume))
