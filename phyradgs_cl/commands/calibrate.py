@@ -1,6 +1,5 @@
 """The command calibrate: estimates a scan's true geometry and timing from its own frames."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -9,7 +8,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan as Loaded
 from phyradgs_cl.calibrate import Calibration, calibrate
 from phyradgs_cl.calibrate.parameters import NAMES, WOBBLE
-from phyradgs_cl.commands.console import AsJson, file_option, option, say
+from phyradgs_cl.commands.console import AsJson, file_option, option, say, say_json
 from phyradgs_cl.commands.options import Device, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import load_beads
@@ -74,7 +73,10 @@ def calibrate_command(
         written["picture"] = str(picture)
         lines.append(f"{picture}: residuals before and after")
     facts = {"scan": str(scan), **result.facts(), **written}
-    say(json.dumps(facts) if as_json else "\n".join([_as_text(result), *lines]))
+    if as_json:
+        say_json(facts)
+    else:
+        say("\n".join([_as_text(result), *lines]))
 
 
 def _check_storable(scan: Loaded, names: list[str]) -> None:

@@ -1,13 +1,12 @@
 """The command check: finds what is wrong or suspicious in a scan."""
 
-import json
 import math
 from pathlib import Path
 from typing import Annotated
 
 from phyradgs_cl.acquisition.plausible import blur_facts, blur_line
 from phyradgs_cl.check import CANNOT_TELL, CENTRE, CheckResult, CountReader, check
-from phyradgs_cl.commands.console import AsJson, file_option, option, say
+from phyradgs_cl.commands.console import AsJson, file_option, option, say, say_json
 from phyradgs_cl.commands.options import Device, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import only_run, read_scan
@@ -46,7 +45,10 @@ def check_command(
         with expecting(scan, "scan"):
             loaded = read_scan(scan, counts)
         result = check(loaded, runtime_for(device), counts, lambda done, total, name: ticker.show(done, total, f"  {name}"))
-    say(_as_json(result, scan, blur_facts(loaded)) if as_json else _as_text(result, blur_line(loaded)))
+    if as_json:
+        say_json(_facts(result, scan, blur_facts(loaded)))
+    else:
+        say(_as_text(result, blur_line(loaded)))
     suspicious = {finding.question for finding in result.suspicious}
     if output is not None:
         _write_copy(scan, output, result, quiet=as_json)
@@ -79,8 +81,7 @@ def _as_text(result: CheckResult, blur: str) -> str:
     return "\n".join([*lines, _NOT_ASKED, f"{suspicious}, {len(open_questions)} cannot be told{names}"])
 
 
-def _as_json(result: CheckResult, scan: Path, blur: dict[str, float]) -> str:
-    offset = {"offset_mm": result.offset_mm, "offset_spread_mm": result.offset_spread_mm}
-    finite = {key: value if math.isfinite(value) else None for key, value in offset.items()}
-    facts = {"scan": str(scan), "suspicious": len(result.suspicious), **finite, **blur}
-    return json.dumps({**facts, "findings": [finding.facts() for finding in result.findings]})
+def _facts(result: CheckResult, scan: Path, blur: dict[str, float]) -> dict[str, object]:
+    facts = {"scan": str(scan), "suspicious": len(result.suspicious), "offset_mm": result.offset_mm}
+    facts |= {"offset_spread_mm": result.offset_spread_mm, **blur}
+    return {**facts, "findings": [finding.facts() for finding in result.findings]}

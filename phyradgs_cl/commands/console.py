@@ -1,5 +1,6 @@
 """What all commands share: makers of options and arguments, printing, exit statuses, help, and ranks under mpiexec."""
 
+import json
 import math
 import os
 import sys
@@ -79,6 +80,11 @@ def file_parser(subject: str) -> Callable[[str], Path]:
         return Path(text)
 
     return file
+
+
+def say_json(facts: Mapping[str, object]) -> None:
+    """Prints facts on stdout as one line of JSON, with null for NaN and infinity, which JSON lacks. Raises OutputError."""
+    say(json.dumps(json.loads(json.dumps(facts, default=str), parse_constant=lambda name: None)))
 
 
 def say(text: str) -> None:

@@ -1,10 +1,18 @@
 """The command evaluate: compares a volume with a reference, such as a scan's true volume."""
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
-from phyradgs_cl.commands.console import AsJson, file_argument, file_option, numbers, option, say, told
+from phyradgs_cl.commands.console import (
+    AsJson,
+    file_argument,
+    file_option,
+    numbers,
+    option,
+    say,
+    say_json,
+    told,
+)
 from phyradgs_cl.metrics import COVERAGE, METRICS
 from phyradgs_cl.workflow import run_evaluation
 
@@ -35,9 +43,8 @@ def evaluate_command(
     facts = run_evaluation(
         volume, reference, picture or usual, reference_voxel_mm, object_motion, rtk_reference, mu_water_per_mm
     )
-    if as_json:  # JSON has no infinity, so the PSNR of equal volumes becomes null
-        finite = json.loads(json.dumps(facts), parse_constant=lambda name: None if name == "Infinity" else float(name))
-        say(json.dumps(finite))
+    if as_json:
+        say_json(facts)
         return
     say("   ".join([*told(facts), str(facts["compared"]), f"picture {facts['picture']}"]))
     if "reliability" in facts:

@@ -1,12 +1,20 @@
 """The commands info and export: print a file's contents, and write a volume for other programs."""
 
-import json
 import textwrap
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from phyradgs_cl import exporters
-from phyradgs_cl.commands.console import AsJson, file_argument, file_option, numbers, option, pair_option, say
+from phyradgs_cl.commands.console import (
+    AsJson,
+    file_argument,
+    file_option,
+    numbers,
+    option,
+    pair_option,
+    say,
+    say_json,
+)
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters.dicom import DicomLabels
 from phyradgs_cl.fields import Hounsfield
@@ -49,7 +57,7 @@ def info_command(
     """Print the contents of a scan or volume file."""
     facts = summary(file)
     if as_json:
-        say(json.dumps(facts, default=str))
+        say_json(facts)
         return
     for key, value in facts.items():
         if value is not None:

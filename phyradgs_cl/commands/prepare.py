@@ -1,10 +1,9 @@
 """The command prepare: corrects the effects of panel and beam in a scan."""
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
-from phyradgs_cl.commands.console import AsJson, file_option, option, say
+from phyradgs_cl.commands.console import AsJson, file_option, option, say, say_json
 from phyradgs_cl.commands.options import Device, Memory, Output, Scan, settings_of, with_options
 from phyradgs_cl.prepare.chain import DEFAULT_STEPS, STEPS_HELP
 from phyradgs_cl.progress import Ticker
@@ -38,7 +37,7 @@ def prepare_command(scan: Scan, output: Output, settings: Settings, as_json: AsJ
         ticker.stage(f"preparing {scan.name}")
         done, before = run_preparation(scan, output, preprocessing, settings.runtime, settings.config)
     if as_json:
-        say(json.dumps({"scan": str(scan), "output": str(output), "steps": done, "steps_before": before}))
+        say_json({"scan": str(scan), "output": str(output), "steps": done, "steps_before": before})
     else:
         earlier = [f"done before  {', '.join(before)}"] if before else []
         say("\n".join([*earlier, *map(_line, done), str(output)]))
