@@ -11,7 +11,6 @@ from typing import NamedTuple
 import h5py
 import numpy as np
 
-from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.assemble import DISTANCES, Turned, cone, parallel
@@ -156,8 +155,7 @@ class Places:
         InputError for other numbers, and where no frame is a projection."""
         for text in self._at("image_key", usual)[:1]:
             with self.opened("image_key", text) as (source, address):
-                key = h5.read_values(source, address, source.dataset(address))
-                checks.shape(source.name(address), key, (frames,))
+                key = h5.read_shaped(source, address, (frames,))
                 key = np.where(key == -1, schema.INVALID, key)  # the nxtomo package writes −1 for alignment frames
                 if not np.isin(key, range(schema.INVALID + 1)).all() or not np.any(key == schema.PROJECTION):
                     expected = "0 projection, 1 flat, 2 dark or 3 invalid, and at least one 0"
@@ -192,9 +190,9 @@ class Places:
                 return None
             with self.opened(name, text) as (source, address):
                 dataset, values = source.dataset(address), np.zeros(frames)
-                fits = dataset.shape == (frames,) and dataset.dtype.kind in "iuf"
+                fits = h5.is_list(dataset, frames) and dataset.dtype.kind in "iuf"
                 if fits:
-                    values = h5.read_values(source, address, dataset).astype(np.float64)
+                    values = h5.read_shaped(source, address, (frames,)).astype(np.float64)
                 kinds = self._key(key, frames)
                 flats = values[(kinds == schema.FLAT) & fits & ("flats" not in self.stated)]
                 return Reading(source.name(address), flats, values[(kinds == schema.PROJECTION) & fits])

@@ -135,7 +135,7 @@ class Fields:
         """Returns the finite numbers (count,) float64 of a list or array; none may be larger in size than ``largest``."""
         values = self.get(key)
         if isinstance(values, np.ndarray):
-            values = values.tolist() if values.ndim == 1 else None
+            values = values.ravel().tolist() if values.size in values.shape else None  # rows and columns are lists too
         expected = f"{_COUNTS.get(count, count)} numbers" if count is not None else "a list of numbers"
         if not isinstance(values, Sequence) or isinstance(values, (str, bytes)):
             raise self.error(key, described(self.get(key)), expected)

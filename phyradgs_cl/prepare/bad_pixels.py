@@ -29,6 +29,9 @@ _MOST_FRAMES = 40  # dead pixels are sought in at most this many frames, evenly 
 _STILL_SIDES = 0.5  # if more than this fraction of the two outermost columns never changes, they are air without noise
 _NEAR_AXIS = 1.5  # a small part of the object this close to the axis, in columns, stays on one pixel in all views
 _SHARED = 0.1  # a dead pixel differs alone: its neighbours differ by less than this fraction of its difference
+_MIRRORED = 0.15  # the mirror image of an object's column about the axis is at least this fraction as high
+_BESIDE = 3  # a needle that sways a little changes the columns beside it: the usual change is that of columns this far away
+_UNLIKE = 4.0  # a column whose standard deviation over frames is this many times smaller or larger varies otherwise
 _LINE = 0.9  # a row or column with more than this fraction of dead pixels is dead as a whole
 
 
@@ -132,7 +135,9 @@ def find_dead(
     all, in more than 70 % of the frames. It must then differ from the median of 3 × 3 pixels by more than ``deviations``
     standard deviations of this difference over the panel. Near ``axis_column`` small parts of the object stay on one pixel:
     there a dead pixel must also be sharper than the optics. A whole row or column is dead if it lies above or below both
-    neighbours over more than 90 % of its length. At most 40 frames, evenly spread, are examined."""
+    neighbours over more than 90 % of its length. A column whose mirror image about the axis does so too may be a needle on
+    the axis or the wall of a tube: it is dead only if it varies otherwise than the columns around. At most 40 frames, evenly
+    spread, are examined."""
     if len(frames) < LEAST_FRAMES:
         return np.zeros(frames.shape[1:], bool)
     numbers = np.unique(np.linspace(0, len(frames) - 1, _MOST_FRAMES).round().astype(int))
@@ -141,12 +146,12 @@ def find_dead(
     if axis_column is not None:
         still = np.abs(np.arange(frames.shape[2]) - axis_column) <= _NEAR_AXIS
     pixels = _constant(some) | (_exceeding(some, deviations) & ~(_shared(some) & still))
-    return pixels | _lines(some, deviations)
+    return pixels | _lines(some, deviations, axis_column)
 
 
-def _lines(frames: np.ndarray, deviations: float) -> np.ndarray:
+def _lines(frames: np.ndarray, deviations: float, axis_column: float | None) -> np.ndarray:
     """Returns whole rows and columns, bool (v, u), that lie above or below both neighbours in over 90 % of their pixels, in
-    the median over frames. Pixels of air count too: an object may be long and thin, but not as long as the panel."""
+    the median over frames, and are none of an object's about the axis. Pixels of air count too."""
     dead = np.zeros(frames.shape[1:], bool)
     floor = 1e-3 * max(float(np.percentile(frames, 99.9)), 1e-9)
     for axis in (0, 1):
@@ -159,7 +164,24 @@ def _lines(frames: np.ndarray, deviations: float) -> np.ndarray:
         peak = np.where(before * after > 0, np.sign(before) * np.minimum(np.abs(before), np.abs(after)), 0)
         exceeds = np.abs(np.median(peak, axis=1)) > deviations * max(usual, floor)
         np.moveaxis(dead, axis, 0)[1 + np.flatnonzero(exceeds.mean(axis=1) > _LINE)] = True
+        if axis == 1 and axis_column is not None and dead.any():
+            dead &= ~(dead.all(axis=0) & _about_axis(frames, axis_column, floor))
     return dead
+
+
+def _about_axis(frames: np.ndarray, axis_column: float, least: float) -> np.ndarray:
+    """Returns the columns, bool (u,), that may be an object's about the axis: mirror images stand out too, and they vary as
+    columns around, up to ``least``. frames: (F, v, u)."""
+    usual = np.median(frames, axis=0)
+    height = np.median(usual - scipy.ndimage.median_filter(usual, (1, 5), mode="nearest"), axis=0)
+    columns, varies = np.arange(len(height)), frames.std(axis=0).mean(axis=0) + least
+    at = np.round(2 * axis_column - columns) + np.array([[-1], [0], [1]])
+    images = np.interp(at, columns, height, left=0, right=0)
+    around = np.interp(columns + np.array([[-_BESIDE], [_BESIDE]]), columns, varies)
+    is_mirrored = np.max(images * np.sign(height), axis=0) > _MIRRORED * np.abs(height)
+    noisier = np.exp(np.maximum(height, 0) / 2)  # fewer photons come through
+    is_calm = varies < np.min(around, axis=0) / _UNLIKE
+    return np.asarray(is_mirrored & ~is_calm & (varies < _UNLIKE * noisier * np.max(around, axis=0)))
 
 
 def _constant(frames: np.ndarray) -> np.ndarray:

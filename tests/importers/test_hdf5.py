@@ -76,6 +76,26 @@ def test_bare_arrays_without_addresses_are_told_how_to_name_them(tmp_path) -> No
     assert import_scan(tmp_path / "a.mat", ImportOptions(**given)).projections.shape == (6, 4, 5)
 
 
+@pytest.mark.parametrize("shape", [(-1, 1), (1, -1), (1, 1, -1)])
+def test_rows_and_columns_are_lists_as_in_matlab(tmp_path, shape) -> None:
+    """Angles, keys, exposures, times, monitor; those of the wrong number are refused."""
+    seconds = {"instrument/detector/count_time": np.full(KEY.size, 0.1).reshape(shape), "control/data": np.ones(KEY.size)}
+    seconds["instrument/detector/frame_start_time"] = np.arange(KEY.size).reshape(shape)
+    lists = {"image_key": KEY.reshape(shape), "rotation_angle": ANGLE_DEG.reshape(shape)}
+    same(nxtomo(tmp_path / "a.nxs", added=seconds, **lists))
+    light = np.linspace(1.0, 0.5, KEY.size)
+    same(lit(tmp_path / "b.nxs", light, **{"control/data": light.reshape(shape)}))
+    bare(tmp_path)
+    with h5py.File(tmp_path / "p.hdf", "r+") as file:
+        for name, count in (("row", 6), ("short", 5)):
+            file[name] = ANGLE_DEG[KEY == 0][:count].reshape(shape)
+    pixels = {"pixel_size_mm": (0.1, 0.1)}
+    same(tmp_path / "p.hdf", ImportOptions(at=(*AT[:3], "angles=/row", AT[-1]), **pixels))
+    for at in ("angles=/short", "angles=/entry/data/data"):
+        with pytest.raises(InputError, match=rf"{at[7:]}: found shape .*; expected shape \(6\)"):
+            import_scan(tmp_path / "p.hdf", ImportOptions(at=(*AT[:3], at, AT[-1]), **pixels))
+
+
 def test_frames_in_linked_files_of_the_folder_are_read(tmp_path) -> None:
     (tmp_path / "raw").mkdir()
     moved(nxtomo(tmp_path / "a.nxs"), tmp_path / "raw/x.h5", h5py.ExternalLink("raw/x.h5", "/raw/frames"))

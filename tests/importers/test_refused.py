@@ -217,6 +217,9 @@ def test_nothing_in_a_pickle_is_executed(tmp_path, make_truth) -> None:
     for opcodes in (b"(S'touch canary'\nios\nsystem\n.", b"cos\nsystem\n(S'touch canary'\ntR.", b"c__builtin__\neval\n."):
         path.write_bytes(opcodes)
         refused(path, None, "naf", "nothing was executed")
+    for made in (b"cnumpy\ndtype\n", b"S'os.system'\n"):
+        path.write_bytes(b"ccopy_reg\n_reconstructor\n(" + made + b"c__builtin__\nobject\nNtR.")
+        refused(path, None, "naf", "a damaged pickle")
     path = w.write("naf", tmp_path, make_truth)
     pickled(lambda d: d["train"].update(projections=np.array([Bomb(canary), None], object)))(path)
     refused(path, None, "naf", "'O8'")

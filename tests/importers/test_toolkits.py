@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from conftest_of_importers import GEOMETRY, WORLD_POINTS, pose_at, projected
 
 from phyradgs_cl.acquisition import CircularOrbit, ParallelGeometry, PoseTable
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
 
 pytestmark = pytest.mark.slow
@@ -23,7 +25,10 @@ FLAT = ParallelGeometry((10, 14), (3.0, 2.5), (3.0, -5.0))
 def test_pixels_and_geometry_are_those_of_the_scan(tmp_path, make_truth, assert_same, form, geometry) -> None:
     writer, name = w.WRITERS[form]
     truth = make_truth(geometry=geometry)
-    truth = replace(truth, scan=replace(truth.scan, grid=replace(truth.scan.grid, voxel_size_mm=(2.0, 1.5, 1.5))))
+    grid = replace(truth.scan.grid, voxel_size_mm=(2.0, 1.5, 1.5))
+    if geometry is FLAT:  # LEAP's volume of a parallel beam has the panel's rows, wherever these are
+        grid = Grid((10, 9, 8), (3.0, 1.5, 1.5), (3.0, -2.0, 3.0))
+    truth = replace(truth, scan=replace(truth.scan, grid=grid, reference=None))
     path = writer(tmp_path / name, truth)
     assert recognise(path) == form
     scan = import_scan(path)
@@ -57,18 +62,42 @@ def test_leap_s_formula_sees_points_where_our_poses_do(tmp_path, make_truth, cap
     np.testing.assert_array_equal(import_scan(path).projections, truth.scan.projections)
 
 
-def test_leap_s_modular_beam_is_a_table_of_views(tmp_path, make_truth, assert_same) -> None:
+@pytest.mark.parametrize("row", [0.0, 4.5, 12.0])
+def test_leap_s_volume_of_a_parallel_beam_is_tied_to_the_panel_s_rows(tmp_path, make_truth, caplog, row) -> None:
+    """Slice k lies at (k − centerRow) · pixelHeight, by LEAP's z_0; its offsetZ is always 0."""
+    truth, volume = make_truth(geometry=FLAT), {"numZ": 10, "voxelHeight": "3.000001", "centerRow": row}
+    grid = import_scan(w.write_leap(tmp_path / "a", truth, **volume, offsetZ=7.0)).grid
+    assert grid.box_mm[0] == pytest.approx((-3.0 * (row + 0.5), 3.0 * (9.5 - row)), abs=1e-4)
+    assert "offsetZ is not used" in caplog.text
+    for i, (name, value) in enumerate({"numZ": 9, "voxelHeight": 2.0}.items()):
+        with pytest.raises(InputError, match=f"{name}: found {value:g}; expected (10|3), the panel's"):
+            import_scan(w.write_leap(tmp_path / str(i), truth, **{**volume, name: value}))
+    none = import_scan(w.write_leap(tmp_path / "b", truth, numZ=None))
+    assert none.grid.box_mm[0].mean() == pytest.approx(FLAT.detector_offset_mm[0], abs=3.0)
+
+
+@pytest.mark.parametrize("long", [1.0, 0.25, 3.0])
+def test_leap_s_modular_beam_is_a_table_of_views(tmp_path, make_truth, assert_same, long) -> None:
+    """Vectors of rows and columns are directions, which LEAP makes orthogonal."""
     truth = make_truth()
     source, first, step_u, step_v = GEOMETRY.pose(truth.angle_rad).reshape(-1, 4, 3).swapaxes(0, 1)
     centre = first + 6.5 * step_u + 4.5 * step_v
-    vectors = {"sourcePositions": source, "moduleCenters": centre, "rowVectors": step_v / 3.0, "colVectors": step_u / 2.5}
-    lines = {name: ", ".join(map(repr, table.ravel().tolist())) for name, table in vectors.items()}
-    path = w.write_leap(tmp_path / "a", truth, **{**lines, "geometry": "modular", "phis": None})
-    scan = import_scan(path)
+    skew = (step_v / 3.0 + 4e-4 * (long != 1) * step_u / 2.5) * np.linspace(1, long, len(step_v))[:, None]
+    vectors = {"sourcePositions": source, "moduleCenters": centre, "rowVectors": skew, "colVectors": step_u / 2.5 * long}
+
+    def written(name: str, **changed: np.ndarray) -> Path:
+        lines = {key: ", ".join(map(repr, table.ravel().tolist())) for key, table in (vectors | changed).items()}
+        return w.write_leap(tmp_path / name, truth, **{**lines, "geometry": "modular", "phis": None})
+
+    scan = import_scan(path := written("a"))
     assert isinstance(scan.trajectory, PoseTable)
     assert_same(scan, truth, grid=False)
     with pytest.raises(InputError, match="rotates with format leap, which states every view"):
         import_scan(path, ImportOptions(rotates="sample"))
+    with pytest.raises(InputError, match="colVectors: found a vector of length 0 in view 2"):
+        import_scan(written("b", colVectors=step_u * (np.arange(6) != 2)[:, None]))
+    with pytest.raises(InputError, match="rowVectors: found 87.71° to colVectors; expected 90°"):
+        import_scan(written("c", rowVectors=step_v / 3.0 + 0.04 * step_u / 2.5))
 
 
 RAW = {"_Frames.xml": "1.his", "ProjectionInfo.xml": "1.hnd", "Scan.xml": "1.xim", "a.ora.xml": "b.ora.xml"}
@@ -96,3 +125,10 @@ def test_tigre_s_centre_of_rotation_and_values_per_frame(tmp_path, make_truth) -
         pose[:6] += np.tile(1.5 * pose[6:9] / 2.5, 2)
         expected = projected(pose, WORLD_POINTS)
         np.testing.assert_allclose(projected(pose_at(scan, frame, 0.5), WORLD_POINTS), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("protocol", range(6))
+def test_tigre_s_geometry_of_every_protocol(tmp_path, make_truth, assert_same, protocol) -> None:
+    """Protocols 0 and 1 make objects by a function of copyreg."""
+    truth = make_truth(geometry=SQUARE)
+    assert_same(import_scan(w.write_tigre(tmp_path / "a.pkl", truth, protocol)), truth, grid=False, pixels=0)

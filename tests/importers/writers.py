@@ -322,9 +322,10 @@ def tigre_geometry(truth: Any, **attributes: object) -> Any:
     return geo
 
 
-def write_tigre(path: Path, truth: Any, **attributes: object) -> Path:
+def write_tigre(path: Path, truth: Any, protocol: int = 4, **attributes: object) -> Path:
     """A pickle of what TIGRE's loaders return."""
-    path.write_bytes(pickle.dumps((truth.scan.projections, tigre_geometry(truth, **attributes), truth.angle_rad)))
+    content = (truth.scan.projections, tigre_geometry(truth, **attributes), truth.angle_rad)
+    path.write_bytes(pickle.dumps(content, protocol))
     return path
 
 

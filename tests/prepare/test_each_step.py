@@ -51,6 +51,42 @@ def test_dead_pixels(rt, clean) -> None:
     assert rms(prepared.projections - clean.projections) < 0.1 * rms(frames - clean.projections)
 
 
+def discs(parts: list[tuple[float, float, float]], axis: float, noise: float) -> np.ndarray:
+    """Frames (60, 9, 41) of upright cylinders by a parallel beam: (per pixel, radius, distance from the axis) in pixels."""
+    at, angle = np.arange(41)[:, None] + np.linspace(-0.4, 0.4, 5), np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    sines = axis + np.sin(angle)[:, None, None] * np.array([x for *_, x in parts])[:, None, None, None]
+    chords = [2 * m * np.sqrt(np.maximum(r**2 - (at - u) ** 2, 0)) for (m, r, _), u in zip(parts, sines, strict=True)]
+    true = np.sum(chords, axis=0).mean(axis=-1)[:, None] * np.linspace(1, 0.9, 9)[:, None]
+    return true + noise * np.exp(true / 2) * np.random.default_rng(3).standard_normal(true.shape)
+
+
+BODY = [(0.02, 15.0, 1.0), (0.03, 3.0, 5.0)]
+ABOUT_AXIS = {
+    "needle": [(0.2, 0.75, 0.0)], "wire that sways": [(0.6, 0.8, 0.2)], "thin wire": [(0.5, 0.4, 0.05)],
+    "metal pin": [(3.0, 0.8, 0.0)], "tube": [(0.3, 11.0, 0.0), (-0.3, 10.3, 0.0)],
+    "bore in a rod": [(0.3, 5.0, 0.0), (-0.3, 0.7, 0.0)], "capillary": [(0.5, 7.3, 0.1), (-0.5, 7.0, 0.1)],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ABOUT_AXIS)
+@pytest.mark.parametrize("axis", [20.0, 18.3])
+@pytest.mark.parametrize("noise", [0.0, 0.002, 0.02])
+def test_needles_on_the_axis_and_tubes_about_it_are_no_dead_columns(name, axis, noise) -> None:
+    """Their columns are constant in all views, as a wrong gain's are. Those beside the axis, without an image, are found."""
+    frames = discs([*BODY, *ABOUT_AXIS[name]], axis, noise)
+    assert not find_dead(frames, axis_column=axis).all(axis=0).any()
+    frames[:, :, 36] += 3.0
+    assert np.flatnonzero(find_dead(frames, axis_column=axis).all(axis=0)).tolist() == [36]
+
+
+@pytest.mark.parametrize("values", [(0.9, 0.0), (1.5, 2e-4), (1.5, 0.6), (-0.3, 0.4), (3.0, 0.0)])
+def test_columns_on_the_axis_that_are_stuck_or_flicker_are_dead(values) -> None:
+    """(mean, deviation) in time, the deviation far from that of the columns around."""
+    frames = discs(BODY, 20.0, 0.005)
+    frames[:, :, 20] = values[0] + values[1] * np.random.default_rng(4).standard_normal((60, 9))
+    assert np.flatnonzero(find_dead(frames, axis_column=20.0).all(axis=0)).tolist() == [20]
+
+
 @SLOW
 def test_scatter(rt, closed_form) -> None:
     """Of a clean scan the fit takes less than the noise of a pixel; of scatter most goes."""

@@ -3,8 +3,9 @@
 At LEAP's angle φ = 0° the source stands at −y, so the gantry's angle is φ − 90°. Columns count in the direction in which the
 gantry turns, and row 0 is the lowest. The ray through the origin falls on centerRow and centerCol. ``tau`` shifts source and
 panel against the columns' direction. A modular beam is a table of sources, panel centres, and directions of rows and
-columns. Units: mm, degrees."""
+columns. The volume of a parallel beam has a slice for each row of the panel, at the row's height. Units: mm, degrees."""
 
+import logging
 from functools import partial
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from phyradgs_cl.importers.series import series_of
 from phyradgs_cl.importers.text import Settings, found_by, read_settings, say_missing
 from phyradgs_cl.importers.tiff import SUFFIXES, read_tiffs
 
+_log = logging.getLogger(__name__)
 _VECTORS = ("sourcePositions", "moduleCenters", "colVectors", "rowVectors")
 _NAMES = (
     *("numX", "numY", "numZ", "voxelWidth", "voxelHeight", "offsetX", "offsetY", "offsetZ", "geometry", "detectorType"),
@@ -32,6 +34,8 @@ _NAMES = (
 _BEAMS = ("cone", "parallel", "modular")
 recognises = found_by((".txt", ".cfg"), b"numAngles", b"numCols")
 _MOST = 1_000_000  # a file with more angles, rows, columns or voxels along an axis is damaged
+_SKEW = 0.01  # LEAP refuses rows and columns whose directions have a larger product, and makes smaller ones 0
+_ROUNDED = 1e-5  # LEAP writes seven digits
 _OF_TABLES = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
 
 
@@ -55,7 +59,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     trajectory, geometry = read(scan, shape, options, timing)
     integrals = line_integrals(str(folder.root), oriented(frames, options, "bottom"), options, convention="attenuation")
     parts, said = (integrals, trajectory, geometry, timing, options, path), series.said if series else ""
-    return assemble.assemble_scan(*parts, title=description.stem, grid=_grid(scan), said=said)
+    return assemble.assemble_scan(*parts, title=description.stem, grid=_grid(scan, geometry), said=said)
 
 
 def _turning(
@@ -93,6 +97,16 @@ def _modular(
 ) -> tuple[PoseTable, Geometry]:
     options.refuse_unused("leap, which states every view", _OF_TABLES)
     source, centre, right, up = (scan.listed(name, 3 * shape[0]).reshape(-1, 3) for name in _VECTORS)
+    for name, vectors in (("colVectors", right), ("rowVectors", up)):  # LEAP takes their directions alone
+        length = np.linalg.norm(vectors, axis=1, keepdims=True)
+        if not length.all():
+            raise scan.error(name, f"a vector of length 0 in view {int(np.argmin(length))}", "directions")
+        vectors /= length
+    product = np.sum(right * up, axis=1, keepdims=True)
+    if np.abs(product).max() > _SKEW:
+        found = f"{90 - np.rad2deg(np.arcsin(np.abs(product).max())):.4g}° to colVectors"
+        raise scan.error("rowVectors", found, "90°, as LEAP demands")
+    up -= product * right
     step_u, step_v = right * scan.length("pixelWidth"), up * scan.length("pixelHeight")
     first = centre - (shape[2] - 1) / 2 * step_u - (shape[1] - 1) / 2 * step_v
     poses = np.concatenate([source, first, step_u, step_v], -1)
@@ -100,9 +114,19 @@ def _modular(
     return assemble.table_over_time(lambda position: along(poses, position), timing, scan.subject, panel)
 
 
-def _grid(scan: Settings) -> Grid | None:
+def _grid(scan: Settings, geometry: Geometry) -> Grid | None:
     if not all(map(scan.has, ("numX", "numY", "numZ", "voxelWidth", "voxelHeight"))):
         return None
     sizes_mm = triple(scan.length(name) for name in ("voxelHeight", "voxelWidth", "voxelWidth"))
     counts = triple(scan.count(f"num{axis}", _MOST) for axis in "ZYX")
-    return Grid(counts, sizes_mm, triple(scan.position(f"offset{axis}") for axis in "ZYX"))
+    z, y, x = (scan.position(f"offset{axis}") for axis in "ZYX")
+    if isinstance(geometry, ParallelGeometry) and scan.word("geometry") == "parallel":
+        rows = ("numZ", counts[0], geometry.detector_shape[0]), ("voxelHeight", sizes_mm[0], geometry.pixel_size_mm[0])
+        for name, found, row in rows:
+            if abs(found - row) > _ROUNDED * row:
+                expected = f"{row:g}, the panel's: LEAP's volume of a parallel beam has a slice for each row"
+                raise scan.error(name, f"{found:g}", expected, "correct it, or remove the lines num and voxel")
+        if z:
+            _log.warning("%s offsetZ is not used: the slices of a parallel beam are the panel's rows", scan.subject)
+        z = geometry.detector_offset_mm[0]
+    return Grid(counts, sizes_mm, (z, y, x))

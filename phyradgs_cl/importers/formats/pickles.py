@@ -120,6 +120,7 @@ class PlainUnpickler(pickle.Unpickler):
             "numpy.core.multiarray.scalar": lambda dtype, raw: _plain_array(raw, dtype, ()).item(),
             "numpy.core.numeric._frombuffer": lambda *arguments: _plain_array(*arguments),
             "_codecs.encode": lambda text, encoding: text.encode("latin1"),
+            "copy_reg._reconstructor": lambda made, *_: made(), "__builtin__.object": object,  # of protocols 0 and 1
         }
         if module.startswith(TIGRE_MODULE) and name in _CLASSES:
             return _Geometry

@@ -97,6 +97,22 @@ def read_values(
         raise source.error(address, f"data that HDF5 cannot read ({error})", "readable data") from error
 
 
+def is_list(dataset: h5py.Dataset, count: int | None) -> bool:
+    """Returns whether a dataset has ``count`` values (None: any number) along one axis. Others may have length 1, since
+    MATLAB stores lists as rows or columns."""
+    return dataset.size in dataset.shape and count in (None, dataset.size)
+
+
+def read_shaped(source: Hdf5Source, address: str, shape: Sequence[int | None], kinds: str = "iuf") -> np.ndarray:
+    """Reads a required dataset in its own type. Raises InputError unless it has the ``shape``, in which None stands for any
+    length, or is such a list. kinds: see ``read_values``."""
+    dataset = source.dataset(address)
+    if not (of_list := len(shape) == 1 and is_list(dataset, shape[0])):
+        checks.shape(source.name(address), dataset, shape)
+    values = read_values(source, address, dataset, kinds)
+    return values.ravel() if of_list else values
+
+
 def read_array(
     source: Hdf5Source, address: str, shape: Sequence[int | None], quantity: Quantity | None = None,
     default: np.ndarray | None = None,
@@ -105,18 +121,14 @@ def read_array(
     shape, values that are not finite, unknown units, and a missing dataset that has no ``default``."""
     if default is not None and source.optional(address) is None:
         return default
-    dataset = source.dataset(address)
-    checks.shape(source.name(address), dataset, shape)
-    return _finite(source, address, read_values(source, address, dataset), quantity)
+    return _finite(source, address, read_shaped(source, address, shape), quantity)
 
 
 def read_per_frame(source: Hdf5Source, address: str, used: np.ndarray, quantity: Quantity) -> np.ndarray:
     """Reads one finite number, in the package's unit, for each frame marked in ``used``, bool (F,). The dataset may have
     numbers for all frames or for the marked ones alone."""
-    dataset = source.dataset(address)
-    if is_of_all := dataset.shape != (int(used.sum()),):
-        checks.shape(source.name(address), dataset, used.shape)
-    values = read_values(source, address, dataset)
+    is_of_all = not is_list(source.dataset(address), int(used.sum()))
+    values = read_shaped(source, address, used.shape if is_of_all else (None,))
     return _finite(source, address, values[used] if is_of_all else values, quantity)
 
 
@@ -150,9 +162,7 @@ def read_length(source: Hdf5Source, address: str, quantity: Quantity) -> float:
 
 def read_integers(source: Hdf5Source, address: str, shape: Sequence[int | None]) -> np.ndarray:
     """Reads a required dataset of whole numbers as int64. Raises InputError for another shape or type."""
-    dataset = source.dataset(address)
-    checks.shape(source.name(address), dataset, shape)
-    return read_values(source, address, dataset, kinds="iu").astype(np.int64)
+    return read_shaped(source, address, shape, kinds="iu").astype(np.int64)
 
 
 def read_word(

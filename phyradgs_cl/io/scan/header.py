@@ -244,7 +244,7 @@ def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bo
     if dataset is None:
         return 0.0
     subject = source.name(address)
-    if dataset.shape not in ((), (1,), used.shape):
+    if dataset.shape != () and not any(h5.is_list(dataset, count) for count in (1, used.size)):
         raise InputError(subject, f"shape {dataset.shape}", f"one number or shape {used.shape}")
     values = h5.read_values(source, address, dataset).astype(np.float64).reshape(-1)
     values = values if values.shape != used.shape else values[used]
@@ -274,9 +274,9 @@ def taken_at(source: Hdf5Source, address: str, image_key: np.ndarray) -> np.ndar
     else their numbers. Times count if flats and projections all have their own: a writer that knows no time of a flat
     repeats another frame's, or leaves 0."""
     numbers, dataset = np.arange(len(image_key), dtype=np.float64), source.find(address)
-    if not isinstance(dataset, h5py.Dataset) or dataset.shape != image_key.shape or dataset.dtype.kind not in "iuf":
+    if not isinstance(dataset, h5py.Dataset) or not h5.is_list(dataset, len(image_key)) or dataset.dtype.kind not in "iuf":
         return numbers
-    times = h5.read_values(source, address, dataset).astype(np.float64)
+    times = h5.read_shaped(source, address, image_key.shape).astype(np.float64)
     own = times[(image_key == schema.PROJECTION) | (image_key == schema.FLAT)]
     return times if np.isfinite(own).all() and len(np.unique(own)) == len(own) else numbers
 
