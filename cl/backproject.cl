@@ -4,13 +4,6 @@
 #include "common/lanes.h"
 #include "common/line_backprojection.h"
 
-/* A sample's weight is divided by depth², as in FDK, or by depth with DISTANCE_POWER 1. inv = 1/depth. */
-#if DISTANCE_POWER == 1
-#define BY_DISTANCE(weight, inv) (weight) * (inv)
-#else
-#define BY_DISTANCE(weight, inv) (weight) * (inv) * (inv)
-#endif
-
 ALWAYS_INLINE vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
 /* Interpolates linearly at LANES places of a line in memory, with the weight wv of the next element. `fits`: two vectors from
    `least` on contain all places; if so, elements are looked up in them, else gathered. */

@@ -49,10 +49,13 @@ static inline int line_seeing(
     return line;
 }
 
-/* A sample's weight: BY_DISTANCE of backproject.cl, at the depth `middle` between both lines, divided by `scale`. */
-#if DISTANCE_POWER == 1 /* divides by the depth, as in backproject.cl */
+/* A sample's weight is divided by depth², as in FDK, or by depth with DISTANCE_POWER 1. inv = 1/depth. Of a pose per line: at
+   the depth `middle` between both lines, and divided by `scale`. */
+#if DISTANCE_POWER == 1
+#define BY_DISTANCE(weight, inv) (weight) * (inv)
 #define BY_LINE(weight, middle, scale) ((weight) / ((middle) * (scale)))
 #else
+#define BY_DISTANCE(weight, inv) (weight) * (inv) * (inv)
 #define BY_LINE(weight, middle, scale) ((weight) / ((middle) * (middle) * (scale)))
 #endif
 
