@@ -71,7 +71,7 @@ __kernel void bin_fill(
     const int k = (int)get_global_id(0);
     if (k >= chunks)
         return;
-    const int stop = min(count, (k + 1) * chunk);
+    const int stop = min(count, (k + 1) * chunk); /* loops as in bin_count: a macro for both was 1.2 to 1.4 times slower */
     for (int g = k * chunk; g < stop; ++g) {
         if (extents[stride + g] < extents[g])
             continue;
