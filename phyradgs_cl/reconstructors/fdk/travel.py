@@ -36,7 +36,7 @@ _NAMED = 0.01  # a warning comes if more than this fraction of the voxels lack v
 _FEW_VIEWS = 24  # fewer views per turn cause a warning: with 24, densities of balls are within 2 %
 _ENOUGH = 0.5  # voxels that fewer views see than this fraction have incomplete data: their density falls towards 0
 _AROUND = 32  # number of points on the rim of the field of view at which ``ends`` tests whether all views see a slice
-_SAME_ROW = 1e-4  # a voxel at most this far beyond the outermost row's view, in slices, counts as seen by that row
+_SAME_ROW = 5e-4  # a voxel at most this far beyond the outermost row, in rows, counts as seen: less than kernels allow
 _PLACES = 33  # most places along a side at which smooth sums over the views are computed, to be interpolated
 _ENDLESS = 1e4  # width in pixels of the columns in ``all_over_seen``: so wide that every voxel projects into one of them
 
@@ -148,15 +148,16 @@ def ends(views: Views, grid: Grid) -> list[tuple[int, int]]:
     # v · depth and depth are linear in z: each has a value in slice 0, (F, rim), and a change from slice to slice, (F, 1)
     (v, v_step), (depth, depth_step) = ((m[:, i] * x + m[:, i + 1] * y + m[:, i + 3], m[:, i + 2]) for i in (4, 8))
     low, high = -np.inf, np.inf
-    for start, step in ((v, v_step), ((rows - 1) * depth - v, (rows - 1) * depth_step - v_step)):  # both ≥ 0 if seen
+    v, v_step, most = v + _SAME_ROW * depth, v_step + _SAME_ROW * depth_step, rows - 1 + 2 * _SAME_ROW
+    for start, step in ((v, v_step), (most * depth - v, most * depth_step - v_step)):  # both ≥ 0 if seen
         root = -start / np.where(step == 0, np.inf, step)
         low = max(low, np.max(root, initial=-np.inf, where=step > 0))
         high = min(high, np.min(root, initial=np.inf, where=step < 0))
         if np.any((step == 0) & (start < 0)):
             high = -np.inf
     slices = grid.shape[0]
-    first = int(np.clip(np.ceil(low - _SAME_ROW), 0, slices))
-    last = int(np.clip(np.floor(high + _SAME_ROW) + 1, first, slices))
+    first = int(np.clip(np.ceil(low), 0, slices))
+    last = int(np.clip(np.floor(high) + 1, first, slices))
     return [(start, stop) for start, stop in ((0, first), (last, slices)) if start < stop]
 
 
