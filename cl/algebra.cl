@@ -18,12 +18,11 @@ static inline vf load_some(__global const float *p, const long count)
 
 static inline void store_some(vf v, __global float *p, const long count)
 {
-    if (count >= LANES) {
+    if (count >= LANES)
         V_STORE(v, p);
-        return;
-    }
-    for (int k = 0; k < count; ++k)
-        p[k] = LANE_OF(v, k);
+    else
+        for (int k = 0; k < count; ++k)
+            p[k] = LANE_OF(v, k);
 }
 
 /* result = max(x + scale y, least) */

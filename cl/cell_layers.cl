@@ -41,11 +41,3 @@ __kernel void layer_average(const long count, __global float *least, __global fl
     least[at] = any ? least[at] - log(total[at]) : 0.0f;
     total[at] = any ? 1.0f / total[at] : 0.0f;
 }
-
-/* Writes the weight of its line to each pixel. */
-__kernel void layer_weights(
-    __global const float *weights, __global float *spread, const int rows, const int columns, const int by_row)
-{
-    PIXEL
-    spread[at] = weight;
-}

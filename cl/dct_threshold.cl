@@ -131,10 +131,9 @@ __kernel void dct_end(
     if (x + LANES <= shape.x) {
         const vf value = V_LOAD(volume + first) - mean;
         V_STORE(nonnegative ? max(value, 0.0f) : value, result + first);
-        return;
-    }
-    for (int k = 0; k < shape.x - x; ++k) {
-        const float value = volume[first + k] - ((const float *)&mean)[k];
-        result[first + k] = nonnegative ? fmax(value, 0.0f) : value;
-    }
+    } else
+        for (int k = 0; k < shape.x - x; ++k) {
+            const float value = volume[first + k] - ((const float *)&mean)[k];
+            result[first + k] = nonnegative ? fmax(value, 0.0f) : value;
+        }
 }

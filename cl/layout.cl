@@ -17,12 +17,11 @@ __kernel void move_rows(
         return;
     source += row_of(from, y, z) + x;
     target += row_of(to, y, z) + x;
-    if (x + LANES <= width) {
+    if (x + LANES <= width)
         V_STORE(V_LOAD(source), target);
-        return;
-    }
-    for (int k = 0; k < width - x; ++k)
-        target[k] = source[k];
+    else
+        for (int k = 0; k < width - x; ++k)
+            target[k] = source[k];
 }
 
 /* Copies and transposes rows and columns. A work-item takes a tile of TILE by TILE elements. */

@@ -178,10 +178,8 @@ __kernel void warp_forward(
     sum = ZERO_OUTSIDE(sum);
 #if LANES > 1
     if (first + LANES > shape.x) { /* another work-item writes the next row */
-        float values[LANES];
-        V_STORE(sum, values);
         for (int l = 0; first + l < shape.x; ++l)
-            result[voxel + l] = values[l];
+            result[voxel + l] = ((float *)&sum)[l];
         return;
     }
 #endif

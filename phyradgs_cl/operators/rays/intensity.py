@@ -120,15 +120,12 @@ class IntensityOperator:
     def _shares_for(self, like: Array) -> list[Any]:
         """Returns the softmax weights of each layer, on the device if ``like`` is there, else on the host."""
         is_there = isinstance(like, DeviceArray)
+        if not self._shares and is_there:
+            self._shares = [np.broadcast_to(weights, self.frames_shape) for weights in self._weights]
         # copies the weights if they are on the host and needed on the device, or the reverse
         if self._shares and isinstance(self._shares[0], DeviceArray) != is_there:
             brought = self._device.array if is_there else self._device.numpy
             self._shares = [brought(share) for share in self._shares]
-        if not self._shares and is_there:
-            spread = [self._device.empty(self.frames_shape) for _ in self._operators]
-            for weights, share in zip(self._uploaded(), spread, strict=True):
-                self._launch("layer_weights", weights, share)
-            self._shares = spread
         return self._shares or self._weights
 
     def _device_average(self, p: list[DeviceArray]) -> tuple[DeviceArray, list[DeviceArray]]:
