@@ -14,7 +14,7 @@ from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 from phyradgs_cl.text import repr_of_changes
 
-# Iterations before ``exact_from`` model motion coarsely, without any loss of quality (docs/results/motion_models.md).
+# Iterations before ``exact_from`` model motion coarsely, with little loss of quality (docs/results/motion_models.md).
 _STATIC_SHARE = 0.4  # the first coarse iterations, this fraction of them, have one pose per frame
 _COARSE_ERROR = 0.1  # the other coarse iterations have at least this ``time_error`` (relative RMS error)
 
@@ -77,7 +77,7 @@ class SplatOptions(MotionOptions):
 
     def motion_at(self, share: float) -> Motion:
         """Returns the motion model after the fraction ``share`` of the run. In place of ``exact`` it is a coarser one before
-        ``exact_from``, where exact motion would gain nothing."""
+        ``exact_from``, where exact motion would gain little."""
         if not isinstance(self.motion, Exact) or share >= self.exact_from:
             return self.motion
         is_first = share < _STATIC_SHARE * self.exact_from
