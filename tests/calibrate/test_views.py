@@ -56,7 +56,7 @@ def test_turns_of_a_smooth_object_on_which_levels_differ_are_left(rt) -> None:
 
 def test_a_slow_wobble_by_splines_of_time(cli, rt, tmp_path, capsys) -> None:
     """With what was corrected in the answer, the picture and the report of a volume."""
-    how = {"size": 24, "detector": 36, "views": 40, "exposure_deg": 3.0, "readout_ratio": 0.5, "noise": "tigre", "dose": 1e5}
+    how = {"size": 24, "detector": 36, "views": 24, "exposure_deg": 5.0, "readout_ratio": 0.5, "noise": "tigre", "dose": 1e5}
     scan = simulate("foot", **how, device=rt)
     parameters = WobbleParameters.of(scan, 6)
     drawn = np.array([np.deg2rad(3.0), 0.1, 0.1]) * np.random.default_rng(1).normal(size=(6, 3))
@@ -68,7 +68,7 @@ def test_a_slow_wobble_by_splines_of_time(cli, rt, tmp_path, capsys) -> None:
     write_scan(path, off)
     assert cli.run(["calibrate", str(path), "--what", "wobble", "--splines", "6", "-o", str(out), "--json"]) == 0
     views = json.loads(capsys.readouterr().out)["views"]
-    assert list(views) == ["turn_deg", "shift_v_mm", "shift_u_mm"] and len(views["turn_deg"]) == 40
+    assert list(views) == ["turn_deg", "shift_v_mm", "shift_u_mm"] and len(views["turn_deg"]) == 24
     by_splines = np.c_[np.deg2rad(views["turn_deg"]), views["shift_v_mm"], views["shift_u_mm"]]
     left, size = (np.sqrt(np.mean(values**2, axis=0)) for values in (by_splines - planted, planted))
     assert np.all(left < [0.4, 0.05, 0.05] * size), left / size
@@ -82,8 +82,8 @@ def test_a_slow_wobble_by_splines_of_time(cli, rt, tmp_path, capsys) -> None:
 def test_a_wobble_does_not_pass_for_a_roll(rt, monkeypatch) -> None:
     """Asked together with what all views share, which is found beside it; found again, it is what is left, beside what had
     been found before."""
-    how = {"size": 16, "detector": 24, "views": 24, "exposure_deg": 7.5, "noise": "tigre", "dose": 1e5}
-    scan, course = simulate("jaw", **how, device=rt), np.cos(np.pi * np.linspace(0, 1, 24))
+    how = {"size": 16, "detector": 24, "views": 12, "exposure_deg": 15.0, "noise": "tigre", "dose": 1e5}
+    scan, course = simulate("jaw", **how, device=rt), np.cos(np.pi * np.linspace(0, 1, 12))
     parameters = WobbleParameters.of(scan)
     planted = parameters.without_gauges(np.stack([0 * course, 0.1 * course**2, 0.15 * course], -1))
     offset_mm = 0.2
