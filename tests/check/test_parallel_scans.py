@@ -11,7 +11,7 @@ from phyradgs_cl.acquisition.altered.coarse import QUICK_COLUMNS, coarse
 from phyradgs_cl.acquisition.altered.variants import mirrored, reversed_rotation, shifted, stretched, turned
 from phyradgs_cl.check import CANNOT_TELL, CENTRE, OK, SUSPICIOUS, check
 from phyradgs_cl.check.orbit import SIGN
-from phyradgs_cl.check.shutter import READOUT
+from phyradgs_cl.check.shutter import EXPOSURE, READOUT
 from phyradgs_cl.check.timing import check_angles
 from phyradgs_cl.commands.check import check_command
 from phyradgs_cl.io import write_scan
@@ -66,9 +66,9 @@ def test_half_a_turn_is_complete_and_less_is_not() -> None:
 
 
 def test_a_right_scan_is_left_alone(rt) -> None:
-    """Laminography knows its sense of rotation; a fly-scan is asked about its readout, which it cannot tell."""
+    """Laminography knows its sense of rotation; a fly-scan is asked about its readout and exposure, which it cannot tell."""
     fly = parallel_scan(views=36, shutter=Shutter(0.05, 0.9))
-    for scan, left_open in ((fly, {SIGN, READOUT}), (laminography_scan(), set())):
+    for scan, left_open in ((fly, {SIGN, READOUT, EXPOSURE}), (laminography_scan(), set())):
         result = check(scan, rt)
         asked = {one.question: one.verdict for one in result.findings}
         assert asked == {question: CANNOT_TELL if question in left_open else OK for question in asked} and SIGN in asked
