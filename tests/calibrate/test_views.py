@@ -29,7 +29,7 @@ def by_name(found):
 
 def test_shifts_of_views_are_found_and_turns_too_small_for_these_voxels_left(rt, right) -> None:
     rng = np.random.default_rng(1)
-    planted = WobbleParameters.of(right).without_gauges(np.array([0.0, 0.125, 0.125]) * rng.normal(size=(15, 3)))
+    planted = WobbleParameters.of(right).without_gauges(np.array([0.0, 0.125, 0.125]) * rng.normal(size=(11, 3)))
     off = perturb(right, GeometryCorrection(), WobbleParameters.of(right).views_of(-planted))
     stages = [Stage(16, 30, 10), Stage(32, 30, 10)]
     found = estimate_views(rt, off, WobbleParameters.of(off), stages, GeometryCorrection(), SILENT)
@@ -132,14 +132,14 @@ def test_an_object_that_moves_is_followed_and_the_file_has_its_poses(cli, rt, ri
 
 def test_gauges_are_what_an_object_elsewhere_or_a_larger_one_looks_like(right) -> None:
     """Of a motion, and of a wobble, in which the panel's offset shows."""
-    parameters, angle = MotionParameters.of(right), np.deg2rad(24 * np.arange(15))
+    parameters, angle = MotionParameters.of(right), 2 * np.pi / 11 * np.arange(11)
     towards = np.linalg.lstsq(parameters.basis, np.stack([np.cos(angle), np.sin(angle)], -1), rcond=None)[0]
     gauges = np.tile(np.arange(6.0), (SPLINES, 1))
     gauges[:, 3:5] += towards
     np.testing.assert_allclose(parameters.without_gauges(gauges), 0, atol=1e-9)
     once = parameters.without_gauges(np.random.default_rng(0).normal(size=(SPLINES, 6)))
     np.testing.assert_allclose(parameters.without_gauges(once), once, atol=1e-12)
-    views, offset = WobbleParameters.of(right), np.tile([0.0, 0.0, 0.2], (15, 1))
-    gauges = np.stack([np.full(15, 0.1), np.full(15, 0.2), 0.3 * np.cos(angle) - 0.1 * np.sin(angle)], -1)
+    views, offset = WobbleParameters.of(right), np.tile([0.0, 0.0, 0.2], (11, 1))
+    gauges = np.stack([np.full(11, 0.1), np.full(11, 0.2), 0.3 * np.cos(angle) - 0.1 * np.sin(angle)], -1)
     np.testing.assert_allclose(views.without_gauges(gauges), 0, atol=1e-12)
     np.testing.assert_allclose(views.without_gauges(offset), offset, atol=1e-12)
