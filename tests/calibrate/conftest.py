@@ -18,7 +18,7 @@ def turned(rt) -> Callable[..., Scan]:
     def make(back: bool = False, model: str = "log", axis: str = "rows") -> Scan:
         geometry = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125))
         scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 2.0), 24, axis, 0)
-        plan = Protocol(views=15, exposure_deg=12.0, readout_ratio=0.5, turns=-1.0 if back else 1.0)
+        plan = Protocol(views=11, exposure_deg=16.0, readout_ratio=0.5, turns=-1.0 if back else 1.0)
         options = SimulationOptions(plan, axis, noise="tigre", dose=1e6, time_samples=8, detector_model=model)
         return simulate(scene.source, geometry, scene.grid, options)
 

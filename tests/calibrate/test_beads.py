@@ -65,7 +65,7 @@ def lying(phantom: EllipsoidPhantom, place=LYING) -> EllipsoidPhantom:
 
 
 def scanned(rt, phantom, axis="rows", model="log", noise="none", is_fly=True, views=12):
-    geometry = ConeGeometry(5.0, 7.0, (36, 32), (0.1, 0.11), (0.02, 0.05))
+    geometry = ConeGeometry(5.0, 7.0, (28, 32), (0.1, 0.11), (0.02, 0.05))
     scene = phantom_scene(rt, phantom, geometry, Grid.cube(20, 2.0), 20, axis, 0, pixel_samples=2)
     plan = Protocol(views=views, exposure_deg=12.0, readout_ratio=0.5, is_fly=is_fly)
     options = SimulationOptions(plan, axis, noise=noise, dose=1e5, time_samples=16, detector_model=model)
@@ -90,8 +90,8 @@ def test_frames_are_those_of_the_simulator(rt, known, axis, model, is_fly) -> No
 @pytest.mark.slow
 def test_a_placement_is_found_and_a_background_taken_out(rt, known) -> None:
     scan, slope = scanned(rt, lying(known), views=5), np.linspace(0, 0.3, 32, dtype=np.float32)
-    mask = np.zeros((36, 32), bool)
-    mask[10:14, 5:20] = True
+    mask = np.zeros((28, 32), bool)
+    mask[6:10, 5:20] = True
     scan = replace(scan, projections=np.asarray(scan.projections) + slope, pixel_mask=mask)
     problem = BeadProblem.of(known, np.array([*LYING, 1.0]) + 0.03, [scan], Stage(128, 6, 4))
     operator = problem.operator(GeometryCorrection())

@@ -12,6 +12,7 @@ from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
 from phyradgs_cl.calibrate.parameters import PARAMETERS
 from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
+from phyradgs_cl.calibrate.run import STAGES
 from phyradgs_cl.calibrate.search import Reduced, Search
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import write_scan
@@ -25,6 +26,12 @@ OFFSET_MM, ROLL_DEG = 0.3, 0.8
 
 def by_name(found):
     return {one.name: one for one in found.parameters}
+
+
+@pytest.fixture
+def one_grid(monkeypatch):
+    """For what the first grid shows as well as the second."""
+    monkeypatch.setattr("phyradgs_cl.calibrate.run.STAGES", STAGES[:1])
 
 
 def test_offset_and_roll_are_found_in_a_file_of_which_all_else_stays(cli, right, tmp_path, capsys) -> None:
@@ -53,7 +60,7 @@ def test_offset_and_roll_are_found_in_a_file_of_which_all_else_stays(cli, right,
     np.testing.assert_allclose(read.trajectory.pose(4, time_s), right.trajectory.pose(4, time_s), atol=0.02)
 
 
-def test_frames_may_be_longer_than_the_encoder_table_of_the_stated_ones(rt, right) -> None:
+def test_frames_may_be_longer_than_the_encoder_table_of_the_stated_ones(rt, right, one_grid) -> None:
     time_s = np.array([right.frame_start_s[0], right.frame_start_s[-1] + right.shutter.span_s])
     angle_rad = np.concatenate([right.trajectory.angle_rad(f, time_s[[end]]) for f, end in ((0, 0), (right.frames - 1, 1))])
     tight = CircularOrbit(right.geometry, EncoderTable(time_s, np.unwrap(angle_rad)))
@@ -73,7 +80,7 @@ def test_a_right_scan_stays_as_it_is(rt, right) -> None:
 
 def test_a_thin_object_leaves_open_what_voxels_follow_badly(rt) -> None:
     """Coarse voxels do not follow a foot that is lifted: what remains of offset-v and tilt-u is their error."""
-    scan = simulate("foot", size=24, detector=32, noise="tigre", dose=28_000, device=rt)
+    scan = simulate("foot", size=24, detector=32, views=15, exposure_deg=12.0, noise="tigre", dose=28_000, device=rt)
     verdicts = {name: one.verdict for name, one in by_name(calibrate(scan, rt, "offset,tilt")).items()}
     assert verdicts == {"offset-u": AGREES, "offset-v": CANNOT_TELL, "tilt-v": AGREES, "tilt-u": CANNOT_TELL}
 
@@ -102,7 +109,7 @@ def test_a_value_returns_to_what_is_stated_where_that_moves_no_other(right, tilt
     assert bool(abs(moved) > 0.5 * deviation[0]) == (tilt in (0.6, -1.3))
 
 
-def test_a_panel_of_one_row_tells_its_offset_and_no_turn(rt, right, monkeypatch, caplog) -> None:
+def test_a_panel_of_one_row_tells_its_offset_and_no_turn(rt, right, one_grid, monkeypatch, caplog) -> None:
     """And what explains the frames worse than what is stated corrects nothing."""
     geometry = replace(right.geometry, detector_shape=(1, 32))
     orbit, shutter = CircularOrbit(geometry, right.trajectory.kinematics), replace(right.shutter, readout_s=0.0)
@@ -160,7 +167,7 @@ def test_blocks_mix_no_rows_that_are_read_at_other_times(rt, turned) -> None:
     assert 0.2 < profile["frozen"][5] < 0.9 and profile["frozen"][4] > 0.05
 
 
-def test_a_detector_that_adds_photons(rt, turned) -> None:
+def test_a_detector_that_adds_photons(rt, turned, one_grid) -> None:
     scan = turned(model="intensity")
     (found,) = calibrate(perturb(scan, GeometryCorrection(offset_u_mm=-OFFSET_MM)), rt, "offset-u").parameters
     assert abs(found.found) < 3 * found.deviation < 0.03 and found.verdict == CORRECTED

@@ -38,7 +38,7 @@ def half_turn(rt):
 
 
 def test_the_offset_of_half_a_turn_is_found_where_check_finds_it(rt, half_turn) -> None:
-    for pixels, verdict in ((2.3, CORRECTED), (-1.5, CORRECTED), (0.0, AGREES)):
+    for pixels, verdict in ((2.3, CORRECTED), (0.0, AGREES)):
         lines = []
         found = calibrate(half_turn(pixels), rt, "offset-u", note=lines.append)
         (offset,) = found.parameters
@@ -64,7 +64,7 @@ def test_the_offset_is_no_shift_that_fits_better(rt) -> None:
     """A shift that leaves fewer rays measured twice always fits better: 27 pixels became 36 where 28 were true."""
     shape, pitch_mm = (16, 64), (1.1, FAN_PITCH_MM)
     true, stated = (ConeGeometry(150.0, 220.0, shape, pitch_mm, (0.0, px * FAN_PITCH_MM)) for px in (TRUE_PX, STATED_PX))
-    angles_deg = 5.0 * np.arange(72)
+    angles_deg = 7.5 * np.arange(48)
     pose = true.pose(np.deg2rad(angles_deg))
     frames = BODY.line_integrals(pose[:, None, None, :3], pixel_centres(pose, shape))
     frames = frames + 0.002 * np.random.default_rng(0).standard_normal(frames.shape)

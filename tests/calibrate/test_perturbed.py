@@ -50,10 +50,10 @@ def test_turns_leave_the_middle_of_the_panel_where_it_is(right) -> None:
 
 
 def test_views_move_by_themselves(right) -> None:
-    views = Views(np.zeros(15), np.zeros((15, 2)))
+    views = Views(np.zeros(11), np.zeros((11, 2)))
     views.turn_rad[3], views.shift_mm[5] = 0.01, (0.2, 0.0)
     after, time_s = perturb(right, GeometryCorrection(), views), np.array([1.0])
-    is_off = [not np.allclose(after.trajectory.pose(f, time_s), right.trajectory.pose(f, time_s)) for f in range(15)]
+    is_off = [not np.allclose(after.trajectory.pose(f, time_s), right.trajectory.pose(f, time_s)) for f in range(11)]
     assert np.flatnonzero(is_off).tolist() == [3, 5]
     shift = (after.trajectory.pose(5, time_s) - right.trajectory.pose(5, time_s))[0]
     np.testing.assert_allclose(shift[3:6], [0, 0, 0.2], atol=1e-12)
@@ -86,8 +86,8 @@ def datasets(path) -> dict[str, object]:
 ])  # fmt: skip
 def test_a_copy_says_what_was_changed_and_nothing_else(right, tmp_path, change, touched) -> None:
     path, copy = tmp_path / "scan.h5", tmp_path / "copy.h5"
-    counts = np.random.default_rng(0).integers(1, 60000, (17, 32, 32)).astype(np.uint16)
-    write_scan(path, right, data=counts, image_key=[1, 2, *[0] * 15], quantity="counts")
+    counts = np.random.default_rng(0).integers(1, 60000, (13, 32, 32)).astype(np.uint16)
+    write_scan(path, right, data=counts, image_key=[1, 2, *[0] * 11], quantity="counts")
     stated = load_scan(path)
     changed = perturb(stated, change)
     copy_with_motion(path, copy, replace(changed, provenance={"why": "a test"}))
@@ -104,7 +104,7 @@ def test_encoder_standing_gantry_and_views_are_copied_too(right, tmp_path) -> No
     path, copy = tmp_path / "scan.h5", tmp_path / "copy.h5"
     table = EncoderTable(np.array([-1.0, 50.0]), np.array([0.0, 7.0]))
     encoded = replace(right, trajectory=CircularOrbit(right.geometry, table))
-    views = Views(0.01 * np.arange(15), 0.1 * np.arange(30).reshape(15, 2))
+    views = Views(0.01 * np.arange(11), 0.1 * np.arange(22).reshape(11, 2))
     for scan, change, off in ((encoded, TIMES, None), (replace(right, is_fly=False), TURNS, None), (right, TURNS, views)):
         write_scan(path, scan)
         changed = perturb(load_scan(path), change, off)

@@ -29,7 +29,7 @@ def by_name(found):
 
 def test_shifts_of_views_are_found_and_turns_too_small_for_these_voxels_left(rt, right) -> None:
     rng = np.random.default_rng(1)
-    planted = WobbleParameters.of(right).without_gauges(np.array([0.0, 0.125, 0.125]) * rng.normal(size=(15, 3)))
+    planted = WobbleParameters.of(right).without_gauges(np.array([0.0, 0.125, 0.125]) * rng.normal(size=(11, 3)))
     off = perturb(right, GeometryCorrection(), WobbleParameters.of(right).views_of(-planted))
     stages = [Stage(16, 30, 10), Stage(32, 30, 10)]
     found = estimate_views(rt, off, WobbleParameters.of(off), stages, GeometryCorrection(), SILENT)
@@ -56,7 +56,7 @@ def test_turns_of_a_smooth_object_on_which_levels_differ_are_left(rt) -> None:
 
 def test_a_slow_wobble_by_splines_of_time(cli, rt, tmp_path, capsys) -> None:
     """With what was corrected in the answer, the picture and the report of a volume."""
-    how = {"size": 24, "detector": 36, "views": 40, "exposure_deg": 3.0, "readout_ratio": 0.5, "noise": "tigre", "dose": 1e5}
+    how = {"size": 24, "detector": 36, "views": 24, "exposure_deg": 5.0, "readout_ratio": 0.5, "noise": "tigre", "dose": 1e5}
     scan = simulate("foot", **how, device=rt)
     parameters = WobbleParameters.of(scan, 6)
     drawn = np.array([np.deg2rad(3.0), 0.1, 0.1]) * np.random.default_rng(1).normal(size=(6, 3))
@@ -68,7 +68,7 @@ def test_a_slow_wobble_by_splines_of_time(cli, rt, tmp_path, capsys) -> None:
     write_scan(path, off)
     assert cli.run(["calibrate", str(path), "--what", "wobble", "--splines", "6", "-o", str(out), "--json"]) == 0
     views = json.loads(capsys.readouterr().out)["views"]
-    assert list(views) == ["turn_deg", "shift_v_mm", "shift_u_mm"] and len(views["turn_deg"]) == 40
+    assert list(views) == ["turn_deg", "shift_v_mm", "shift_u_mm"] and len(views["turn_deg"]) == 24
     by_splines = np.c_[np.deg2rad(views["turn_deg"]), views["shift_v_mm"], views["shift_u_mm"]]
     left, size = (np.sqrt(np.mean(values**2, axis=0)) for values in (by_splines - planted, planted))
     assert np.all(left < [0.4, 0.05, 0.05] * size), left / size
@@ -82,8 +82,8 @@ def test_a_slow_wobble_by_splines_of_time(cli, rt, tmp_path, capsys) -> None:
 def test_a_wobble_does_not_pass_for_a_roll(rt, monkeypatch) -> None:
     """Asked together with what all views share, which is found beside it; found again, it is what is left, beside what had
     been found before."""
-    how = {"size": 16, "detector": 24, "views": 24, "exposure_deg": 7.5, "noise": "tigre", "dose": 1e5}
-    scan, course = simulate("jaw", **how, device=rt), np.cos(np.pi * np.linspace(0, 1, 24))
+    how = {"size": 16, "detector": 24, "views": 12, "exposure_deg": 15.0, "noise": "tigre", "dose": 1e5}
+    scan, course = simulate("jaw", **how, device=rt), np.cos(np.pi * np.linspace(0, 1, 12))
     parameters = WobbleParameters.of(scan)
     planted = parameters.without_gauges(np.stack([0 * course, 0.1 * course**2, 0.15 * course], -1))
     offset_mm = 0.2
@@ -132,14 +132,14 @@ def test_an_object_that_moves_is_followed_and_the_file_has_its_poses(cli, rt, ri
 
 def test_gauges_are_what_an_object_elsewhere_or_a_larger_one_looks_like(right) -> None:
     """Of a motion, and of a wobble, in which the panel's offset shows."""
-    parameters, angle = MotionParameters.of(right), np.deg2rad(24 * np.arange(15))
+    parameters, angle = MotionParameters.of(right), 2 * np.pi / 11 * np.arange(11)
     towards = np.linalg.lstsq(parameters.basis, np.stack([np.cos(angle), np.sin(angle)], -1), rcond=None)[0]
     gauges = np.tile(np.arange(6.0), (SPLINES, 1))
     gauges[:, 3:5] += towards
     np.testing.assert_allclose(parameters.without_gauges(gauges), 0, atol=1e-9)
     once = parameters.without_gauges(np.random.default_rng(0).normal(size=(SPLINES, 6)))
     np.testing.assert_allclose(parameters.without_gauges(once), once, atol=1e-12)
-    views, offset = WobbleParameters.of(right), np.tile([0.0, 0.0, 0.2], (15, 1))
-    gauges = np.stack([np.full(15, 0.1), np.full(15, 0.2), 0.3 * np.cos(angle) - 0.1 * np.sin(angle)], -1)
+    views, offset = WobbleParameters.of(right), np.tile([0.0, 0.0, 0.2], (11, 1))
+    gauges = np.stack([np.full(11, 0.1), np.full(11, 0.2), 0.3 * np.cos(angle) - 0.1 * np.sin(angle)], -1)
     np.testing.assert_allclose(views.without_gauges(gauges), 0, atol=1e-12)
     np.testing.assert_allclose(views.without_gauges(offset), offset, atol=1e-12)

@@ -25,7 +25,15 @@ def scan_of(rt) -> Callable[..., Scan]:
     return make
 
 
+PANEL = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125))
+
+
 @pytest.fixture(scope="session")
 def clean(scan_of) -> Scan:
-    geometry = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125))
-    return scan_of(geometry, views=15, exposure_deg=24.0, readout_ratio=0.5)
+    return scan_of(PANEL, views=15, exposure_deg=24.0, readout_ratio=0.5)
+
+
+@pytest.fixture(scope="session")
+def still(scan_of) -> Scan:
+    """Stop-and-shoot, which is asked less: for what no readout changes."""
+    return scan_of(PANEL, views=15, exposure_deg=24.0, is_fly=False)

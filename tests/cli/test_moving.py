@@ -16,7 +16,7 @@ from phyradgs_cl.workflow.volumes import compared_states
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("fast_pictures")]
 MOTION = 'kind = "breathing"\namplitude = 0.3\nperiod_s = 2.0\nstates = 3\n'
-SCAN = "--phantom jaw --size 16 --detector 12 --views 4 --time-samples 1 --protocol static"
+SCAN = "--phantom jaw --size 12 --detector 12 --views 4 --time-samples 1 --protocol static"
 
 
 @pytest.fixture(scope="module")

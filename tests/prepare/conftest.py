@@ -31,7 +31,7 @@ def planted(rt) -> Planted:
 
     @cache
     def make(**effects: float) -> Scan:
-        usual = {"size": 28, "detector": 42, "views": 50, "exposure_deg": 5.0, "peak": 3.0, "noise": "beer", "dose": 1e5}
+        usual = {"size": 20, "detector": 30, "views": 36, "exposure_deg": 8.0, "peak": 3.0, "noise": "beer", "dose": 1e5}
         return simulate("jaw", device=rt, **{**usual, **effects})
 
     return make

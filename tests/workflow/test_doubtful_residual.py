@@ -17,8 +17,8 @@ LINE = "the volume does not explain"
 @pytest.fixture(scope="module")
 def fly(rt) -> Scan:
     """A fly-scan of 25 views."""
-    geometry = ConeGeometry(5.0, 7.0, (48, 48), (4 / 48, 4 / 48))
-    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(32, 2.0), 32, "rows", 0)
+    geometry = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125))
+    scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 2.0), 24, "rows", 0)
     options = SimulationOptions(make_protocol("rapid"), "rows", noise="tigre", dose=1e4, time_samples=8)
     return replace(simulate(scene.source, geometry, scene.grid, options), reference=None)
 
@@ -37,10 +37,10 @@ def stated(scan: Scan, frames: np.ndarray | None = None, **geometry: object) -> 
 
 RIGHT = {
     "1000 photons": lambda scan: of_photons(scan, 1000),
-    "truncated": lambda scan: stated(scan, scan.projections[:, :, 12:36], detector_shape=(48, 24)),
+    "truncated": lambda scan: stated(scan, scan.projections[:, :, 8:24], detector_shape=(32, 16)),
 }
 WRONG = {
-    "axis off by 10 pixels": lambda scan: stated(scan, detector_offset_mm=(0.0, 10 * 4 / 48)),
+    "axis off by 7 pixels": lambda scan: stated(scan, detector_offset_mm=(0.0, 7 * 0.125)),
     "no flats": lambda scan: stated(scan, scan.projections - np.log(2e4)),
 }
 
