@@ -34,6 +34,11 @@ FIELD = Deformation(
 
 
 @pytest.fixture(scope="module")
+def gpu_like() -> Runtime:
+    return Runtime(lanes=1, pixel_items=True)
+
+
+@pytest.fixture(scope="module")
 def scan(rt) -> Scan:
     x = np.linspace(-1, 1, 14)
     ball = (x[None, None] ** 2 + x[None, 1:13, None] ** 2 + x[1:12, None, None] ** 2 < 0.6).astype(np.float32)
@@ -42,7 +47,7 @@ def scan(rt) -> Scan:
 
 
 @pytest.mark.parametrize(("name", "changes", "is_moving"), RUNS)
-def test_methods(rt, scan, name, changes, is_moving) -> None:
+def test_methods(rt, gpu_like, scan, name, changes, is_moving) -> None:
     plan = plan_run(name, changes, object_motion=ObjectMotion(FIELD) if is_moving else None)
-    found, expected = (reconstruct(scan, plan, of).volume for of in (Runtime(lanes=1, pixel_items=True), rt))
+    found, expected = (reconstruct(scan, plan, of).volume for of in (gpu_like, rt))
     assert np.linalg.norm(found - expected) <= LAUNCH_SHAPE * np.linalg.norm(expected)
