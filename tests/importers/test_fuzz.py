@@ -1,6 +1,6 @@
 """Every reader on files that are cut off, with changed bytes, and with values of other types: a value, or one error.
 
-`make stress` sets STRESS, by which the numbers of files are multiplied."""
+`make stress` sets STRESS, by which the numbers of files are multiplied: without it a few of each."""
 
 import random
 import re
@@ -16,7 +16,7 @@ import SimpleITK as sitk
 import tifffile
 import writers_of_importers as w
 from damage import changed, put, removed, value
-from stress import TIMES
+from stress import STRESSED, TIMES
 
 from phyradgs_cl.errors import PhyradgsError
 from phyradgs_cl.exporters.writers import write_zarr
@@ -134,7 +134,7 @@ def with_other_values(content: bytes, draw: random.Random, _: int) -> bytes:
 def damaged(file: Path, read: Callable[[], object], draw: random.Random) -> Iterator[tuple[str, bool]]:
     """Damages a file in one way after the other. Yields what was done, and whether a file that is read must be refused."""
     content = file.read_bytes()
-    for _ in range(5 * TIMES):
+    for _ in range(5 * TIMES if STRESSED else 2):
         share = draw.uniform(0.02, 0.98)
         file.write_bytes(content[: int(share * len(content))])
         yield f"cut off after {share:.3f}", share < 0.9 and file.suffix not in TEXTS
@@ -144,7 +144,7 @@ def damaged(file: Path, read: Callable[[], object], draw: random.Random) -> Iter
         return
     ways = [with_other_bytes, *([with_other_values] if file.suffix in TEXTS else [])]
     for way in ways:
-        for _ in range(12 * TIMES):
+        for _ in range(12 * TIMES if STRESSED else 5):
             file.write_bytes(new := way(content, draw, len(content) // 2 if file.suffix in IMAGES else 0))
             yield repr(new[:2000]), False
     file.write_bytes(content)

@@ -48,7 +48,7 @@ def maps(prior: Prior, rt, shape: tuple[int, int, int], count: int = 1) -> list[
 
 def test_each_prior_is_better_than_none_and_subsets_are_quicker(rt, scan) -> None:
     names = ("none", "tv", "dct", "ridge")
-    runs = (run(rt, scan, "fista", motion="per-row", iterations=20, prior=prior) for prior in names)
+    runs = (run(rt, scan, "fista", motion="per-row", iterations=8, prior=prior) for prior in names)
     without, *found = (quality(scan, one.volume) for one in runs)
     assert min(found) > without + 0.5, (found, without)
     few, whole = (run(rt, scan, "fista", iterations=3, subsets=count).record[-1]["residual"] for count in (4, 1))
@@ -100,7 +100,7 @@ def test_a_prior_image_helps_where_it_is_right_and_costs_little_where_it_is_wron
     few = replace(scan, projections=scan.projections[::3], frame_start_s=scan.frame_start_s[::3])
     changed = scan.reference.copy()
     changed[8:14, 4:10, 8:14] = 0
-    usual = {"motion": "per-row", "iterations": 20}
+    usual = {"motion": "per-row", "iterations": 8}
     plain = quality(few, run(rt, few, "fista", prior="tv", **usual).volume)
     images = InitialVolume(changed, few.grid), InitialVolume(scan.reference[:, ::-1].copy(), few.grid)
     pairs = zip(images, (0.5, 0.3), strict=True)
