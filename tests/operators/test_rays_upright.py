@@ -162,7 +162,7 @@ ADJOINTS = {
     "static": (GRID, TALL_PANEL, {}), "a wide panel": (GRID, (131, 18), {"frames": 1}), "a column": (GRID, (96, 1), {}),
     "few lines per voxel": (Grid((38, 20, 22), (0.05, 0.06, 0.06)), (24, 9), {}),
     "many lines per voxel": (Grid((6, 9, 11), (0.3, 0.2, 0.15)), (150, 9), {}),
-    "more voxels than a work-item's": (Grid((150, 20, 21), (0.013,) * 3, (0.0, 0.1, 0.0)), (85, 40), {"frames": 1}),
+    "more voxels than a work-item's": (Grid((150, 20, 21), (0.013,) * 3, (0.0, 0.1, 0.0)), (85, 40), {}),
     "a voxel": (Grid((1, 1, 1), (1.9, 0.2, 0.3)), TALL_PANEL, {}),
     "a source close by": (Grid((9, 30, 30), (2 / 30,) * 3), TALL_PANEL, {"source_mm": 1.3}),
 }

@@ -60,7 +60,6 @@ def error(scan: Scan, volume: np.ndarray) -> float:
 @pytest.mark.parametrize(("method", "changes", "share"), [
     ("fista", {"iterations": 4}, 0.7), ("os-sart", {"iterations": 8}, 0.7), ("fdk", {"motion": "static"}, 0.8),
     ("fdk", {"motion": "per-row"}, 0.8), ("phyradgs", {"iterations": 240, "gaussians": 600}, 0.75),
-    ("r2", {"iterations": 100, "gaussians": 600}, 0.97),
 ])  # fmt: skip
 def test_the_reference_is_nearer_and_no_bit_is_other_where_nothing_moves(rt, scan, method, changes, share) -> None:
     ignored, moved = (reconstruct(scan, plan_of(method, field, **changes), rt) for field in (None, breathing()))
