@@ -195,14 +195,13 @@ def test_behind_the_source_at_any_time_nothing_is_seen(two_rt, make_cloud, make_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("readout", "affine", "n"), [
-    (("rows", 1), False, 2), (("columns", -1), False, 1), (("rows", -1), True, 1),
-])  # fmt: skip
-def test_splats_of_which_only_the_centres_move(two_rt, make_cloud, make_geometry, finite_differences, readout, affine, n):
+@pytest.mark.parametrize(("readout", "affine"), [(("rows", 1), False), (("columns", -1), False), (("rows", -1), True)])
+def test_splats_of_which_only_the_centres_move(two_rt, make_cloud, make_geometry, finite_differences, readout, affine):
     """A cutoff at six sigmas leaves gradients as they are."""
     shutter = Shutter(0.8, 0.6, *readout)
     table = frame_cells("centres", make_geometry(*SHAPE, offset=(0.15, -0.25)), 3, 2, shutter=shutter)
-    rows, h, options = make_cloud(n, 21, scale=(0.05, 0.3)), weights(SHAPE), {"affine": affine, "cutoff_sigma": 0.0}
+    rows, h = make_cloud(1 + (readout == ("rows", 1)), 21, scale=(0.05, 0.3)), weights(SHAPE)
+    options = {"affine": affine, "cutoff_sigma": 0.0}
     assert_near(render(two_rt, rows, table, SHAPE, **options), moving_frame(rows, table, SHAPE, affine=affine), SPLAT_MOVING)
     expected = by_gaussian(finite_differences, lambda r: (h * moving_frame(r, table, SHAPE, affine=affine)).sum(), rows)
     whole = gradients(two_rt, rows, table, h, **options)

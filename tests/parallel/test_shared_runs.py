@@ -30,13 +30,14 @@ def on_ranks(ranks_of, scan):
     """(size, method, options, more of a reconstruction) → the result of every rank. A rank keeps its Runtime."""
     runtimes = [Runtime() for _ in range(4)]
 
-    def of(ranks, plan: RunPlan, more):
-        (rt := runtimes[ranks.rank]).ranks = ranks
-        return reconstruct(scan, plan, rt, **more)
-
     def run(size: int, method: str, options=None, seed: int = 0, **more):
         plan = RunPlan(method, options or method_options(method), seed=seed)
-        return ranks_of(size, lambda ranks: of(ranks, plan, more))
+
+        def on(ranks):
+            (rt := runtimes[ranks.rank]).ranks = ranks
+            return reconstruct(scan, plan, rt, **more)
+
+        return ranks_of(size, on)
 
     return run
 
