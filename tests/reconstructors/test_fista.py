@@ -48,7 +48,7 @@ def maps(prior: Prior, rt, shape: tuple[int, int, int], count: int = 1) -> list[
 
 def test_each_prior_is_better_than_none_and_subsets_are_quicker(rt, scan) -> None:
     names = ("none", "tv", "dct", "ridge")
-    runs = (run(rt, scan, "fista", motion="per-row", iterations=6, prior=prior) for prior in names)
+    runs = (run(rt, scan, "fista", motion="per-row", iterations=8, prior=prior) for prior in names)
     without, *found = (quality(scan, one.volume) for one in runs)
     assert min(found) > without + 0.5, (found, without)
     few, whole = (run(rt, scan, "fista", iterations=3, subsets=count).record[-1]["residual"] for count in (4, 1))
