@@ -16,7 +16,6 @@ from tolerances import (
     MOVING_GRADIENT,
     SEGMENTS_ORDER,
     SPLAT_MOVING,
-    STANDING_PICTURE,
     TIME_RULE,
 )
 
@@ -68,7 +67,7 @@ def fast_cloud(seed: int, count: int) -> np.ndarray:
 
 
 @MODELS
-@pytest.mark.parametrize("speed", [1e-3, 0.5, 2.0])
+@pytest.mark.parametrize("speed", [1e-6, 0.5, 2.0])
 def test_frames_and_gradients_are_the_quadrature(any_rt, make_cloud, make_geometry, finite_differences, speed, affine):
     rows = make_cloud(4, 41, scale=(0.05, 0.3))
     table = table_of(make_geometry(*SHAPE, offset=(0.15, -0.25)), Shutter(0.8, 0.6), speed, 3)
@@ -174,15 +173,6 @@ def test_a_third_of_the_micro_views_error_with_a_tenth_of_their_poses(rt, make_c
         errors.append([np.linalg.norm(frame - reference) / np.linalg.norm(reference) for frame in frames])
     exact, micro = np.mean(errors, axis=0)
     assert exact <= EXACT_OVER_MICRO_VIEWS * micro
-
-
-def test_slow_motion_is_almost_the_static_picture(rt, make_cloud, make_geometry) -> None:
-    """And a gantry at rest is one static cell."""
-    rows, slow = make_cloud(5, 52), table_of(make_geometry(*SHAPE), Shutter(0.8, 0.6), 1e-6, 2)
-    still = table_of(make_geometry(*SHAPE), Shutter(0.8, 0.6), 0.0, 2)
-    assert slow.end_poses is not None and still.end_poses is None
-    frames = [render(rt, rows, table, SHAPE, cutoff_sigma=0.0) for table in (slow, still)]
-    assert_near(*frames, STANDING_PICTURE)
 
 
 def test_behind_the_source_at_any_time_nothing_is_seen(two_rt, make_cloud, make_geometry) -> None:
