@@ -1,6 +1,6 @@
 """Every reader on files that are cut off, with changed bytes, and with values of other types: a value, or one error.
 
-`make stress` sets STRESS, by which the numbers of files are multiplied."""
+`make stress` sets STRESS, by which the numbers of files are multiplied: without it a few of each."""
 
 import random
 import re
@@ -16,7 +16,7 @@ import SimpleITK as sitk
 import tifffile
 import writers_of_importers as w
 from damage import changed, put, removed, value
-from stress import TIMES
+from stress import STRESSED, TIMES
 
 from phyradgs_cl.errors import PhyradgsError
 from phyradgs_cl.exporters.writers import write_zarr
@@ -102,8 +102,8 @@ def changed_objects(file: Path, read: Callable[[], object], draw: random.Random)
     with h5py.File(file) as opened:
         opened.visit(addresses.append)
     for address in addresses:
-        is_needed = False
-        for change in ("removed", *draw.sample(sorted(CHANGES), min(len(CHANGES), TIMES))):
+        is_needed, drawn = False, draw.sample(sorted(CHANGES), min(len(CHANGES), TIMES))
+        for change in ("removed", *drawn):
             file.write_bytes(content)
             with h5py.File(file, "r+") as opened:
                 is_number = isinstance(opened[address], h5py.Dataset) and opened[address].dtype.kind in "iuf"
@@ -112,7 +112,8 @@ def changed_objects(file: Path, read: Callable[[], object], draw: random.Random)
                 except (TypeError, ValueError, AttributeError):  # no such change of a group, or of a text
                     continue
             yield f"{address}: {change}", is_needed and is_number and change in WRONG
-            is_needed = is_needed or (change == "removed" and not answered(read, address))
+            if change == "removed" and not {*drawn}.isdisjoint(WRONG):
+                is_needed = is_needed or not answered(read, address)
 
 
 def with_other_bytes(content: bytes, draw: random.Random, first: int) -> bytes:
@@ -134,7 +135,7 @@ def with_other_values(content: bytes, draw: random.Random, _: int) -> bytes:
 def damaged(file: Path, read: Callable[[], object], draw: random.Random) -> Iterator[tuple[str, bool]]:
     """Damages a file in one way after the other. Yields what was done, and whether a file that is read must be refused."""
     content = file.read_bytes()
-    for _ in range(5 * TIMES):
+    for _ in range(5 * TIMES if STRESSED else 2):
         share = draw.uniform(0.02, 0.98)
         file.write_bytes(content[: int(share * len(content))])
         yield f"cut off after {share:.3f}", share < 0.9 and file.suffix not in TEXTS
@@ -144,7 +145,7 @@ def damaged(file: Path, read: Callable[[], object], draw: random.Random) -> Iter
         return
     ways = [with_other_bytes, *([with_other_values] if file.suffix in TEXTS else [])]
     for way in ways:
-        for _ in range(12 * TIMES):
+        for _ in range(12 * TIMES if STRESSED else 5):
             file.write_bytes(new := way(content, draw, len(content) // 2 if file.suffix in IMAGES else 0))
             yield repr(new[:2000]), False
     file.write_bytes(content)

@@ -135,13 +135,14 @@ def test_panels_that_lean(cpu_rt, motion, axis, lean_deg, shape) -> None:
 
 def test_frames_without_gaps_share_their_poses(cpu_rt, monkeypatch) -> None:
     """The end of a frame and the beginning of the next are projected once; a subset of frames has the same bits."""
-    cells, x = tables("gapless", TALL_PANEL, frames=4), noise(GRID.shape, 115)
-    operator = RayOperator(cpu_rt, GRID, TALL_PANEL, cells)
+    shape = (85, 3)
+    cells, x = tables("gapless", shape, frames=4), noise(GRID.shape, 115)
+    operator = RayOperator(cpu_rt, GRID, shape, cells)
     frames = operator.forward(x)
     slots = operator._slots[(0, 4)]
     assert slots.count < sum(table.count for table in cells) - 5
-    assert_frames(frames, cells, x)
-    y = noise((4, *TALL_PANEL), 116)
+    assert_frames(frames, cells, x, shape)
+    y = noise((4, *shape), 116)
     assert_volume(operator.adjoint(y), cells, y)
     np.testing.assert_allclose(operator.subset([2, 0]).forward(x), frames[[2, 0]], rtol=0, atol=RAYS * frames.max())
 
@@ -158,7 +159,7 @@ def test_slots_stay_within_their_memory_where_lines_far_apart_share_a_pose(cpu_r
 
 
 ADJOINTS = {
-    "static": (GRID, TALL_PANEL, {}), "a wide panel": (GRID, (131, 18), {}), "a column": (GRID, (96, 1), {}),
+    "static": (GRID, TALL_PANEL, {}), "a wide panel": (GRID, (131, 18), {"frames": 1}), "a column": (GRID, (96, 1), {}),
     "few lines per voxel": (Grid((38, 20, 22), (0.05, 0.06, 0.06)), (24, 9), {}),
     "many lines per voxel": (Grid((6, 9, 11), (0.3, 0.2, 0.15)), (150, 9), {}),
     "more voxels than a work-item's": (Grid((150, 20, 21), (0.013,) * 3, (0.0, 0.1, 0.0)), (85, 40), {}),
@@ -169,8 +170,9 @@ ADJOINTS = {
 
 @pytest.mark.parametrize("case", ADJOINTS)
 def test_the_adjoint_is_the_twins(cpu_rt, monkeypatch, case) -> None:
-    grid, shape, source = ADJOINTS[case]
-    cells, y = tables("static", shape, frames=2, **source), noise((2, *shape), 108)
+    grid, shape, changes = ADJOINTS[case]
+    cells = tables("static", shape, **{"frames": 2, **changes})
+    y = noise((len(cells), *shape), 108)
     with monkeypatch.context() as patch:
         launched = note_launches(patch)
         found = RayOperator(cpu_rt, grid, shape, cells).adjoint(y)

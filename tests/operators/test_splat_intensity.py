@@ -20,13 +20,14 @@ pytestmark = pytest.mark.slow
 
 SHAPE = (13, 18)
 UNIT = 2.5  # line integrals up to 6
+COUNTS = {"static": (), "micro-views": (2, 2), "exact": (2,), "per-row": (2,)}
 MakeTable = Callable[..., TimeCells]
 
 
 @pytest.fixture
 def make_table(make_geometry) -> MakeTable:
     geometry = make_geometry(*SHAPE, offset=(0.15, -0.25))
-    return lambda motion, *readout: frame_cells(motion, geometry, shutter=Shutter(0.8, 0.6, *readout), speed=0.9)
+    return lambda motion, *way: frame_cells(motion, geometry, *COUNTS[motion], shutter=Shutter(0.8, 0.6, *way), speed=0.9)
 
 
 @remembered

@@ -74,14 +74,15 @@ def test_a_cloud_in_every_state_is_its_twin(two_rt, make_cloud, make_geometry, c
 @pytest.mark.slow
 @pytest.mark.parametrize(("motion", "counts", "beam", "affine"), [
     ("micro-views", (2, 2), "cone", False), ("micro-views", (2, 2), "cone", True), ("exact", (2,), "cone", False),
-    ("exact", (2,), "cone", True), ("static", (), "parallel", False), ("exact", (1,), "parallel", False),
+    ("exact", (1,), "cone", True), ("static", (), "parallel", False), ("exact", (1,), "parallel", False),
 ])  # fmt: skip
 def test_frames_and_gradients_are_those_of_the_twin(
     rt, make_cloud, make_geometry, finite_differences, motion, counts, beam, affine
 ) -> None:
     parallel = ParallelGeometry(SHAPE, (2.6 / 13, 2.7 / 18))
     table = frame_cells(motion, make_geometry(*SHAPE, offset=(0.15, -0.25)) if beam == "cone" else parallel, *counts)
-    check_frame_and_gradients(rt, finite_differences, make_cloud(2, 41, scale=(0.05, 0.3)), table, deformation(), affine)
+    rows = make_cloud(2 if motion == "micro-views" and not affine else 1, 41, scale=(0.05, 0.3))
+    check_frame_and_gradients(rt, finite_differences, rows, table, deformation(), affine)
 
 
 @pytest.mark.slow

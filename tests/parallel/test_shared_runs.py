@@ -27,19 +27,25 @@ def scan() -> Scan:
 
 @pytest.fixture(scope="module")
 def on_ranks(ranks_of, scan):
-    """(size, method, options, more of a reconstruction) → the result of every rank."""
+    """(size, method, options, more of a reconstruction) → the result of every rank. A rank keeps its Runtime."""
+    runtimes = [Runtime() for _ in range(4)]
 
     def run(size: int, method: str, options=None, seed: int = 0, **more):
         plan = RunPlan(method, options or method_options(method), seed=seed)
-        return ranks_of(size, lambda ranks: reconstruct(scan, plan, Runtime(ranks=ranks), **more))
+
+        def on(ranks):
+            (rt := runtimes[ranks.rank]).ranks = ranks
+            return reconstruct(scan, plan, rt, **more)
+
+        return ranks_of(size, on)
 
     return run
 
 
 @pytest.mark.parametrize("name", DIVIDED)
-def test_same_bits_on_any_number_of_ranks(on_ranks, scan, name) -> None:
+def test_same_bits_on_any_number_of_ranks(rt, on_ranks, scan, name) -> None:
     options = DIVIDED[name]
-    one = reconstruct(scan, RunPlan("phyradgs", options, seed=1), Runtime())
+    one = reconstruct(scan, RunPlan("phyradgs", options, seed=1), rt)
     assert one.gaussians.count != one.facts["gaussians_first"]  # density control has acted
     for size in (2, 4) if options is OPTIONS else (3,):
         found = on_ranks(size, "phyradgs", options, seed=1)
@@ -49,9 +55,9 @@ def test_same_bits_on_any_number_of_ranks(on_ranks, scan, name) -> None:
             assert [r["loss"] for r in result.record] == [r["loss"] for r in one.record]
 
 
-def test_a_batch_s_gradient_is_the_sum_of_its_frames(scan) -> None:
+def test_a_batch_s_gradient_is_the_sum_of_its_frames(rt, scan) -> None:
     """Sub-volumes and parameter terms included: each frame brings its own."""
-    run = started(scan, replace(OPTIONS, parameter_terms_from=0), Runtime())
+    run = started(scan, replace(OPTIONS, parameter_terms_from=0), rt)
     batch, download = run.next_batch(), run.rt.download
     run.adam.activate(run.cloud.raw, run.cloud.gaussians.rows, run.cloud.count, run.cloud.gaussians.stride)
     run.frame_step.differentiate(run.cloud, batch)
@@ -65,10 +71,10 @@ def test_a_batch_s_gradient_is_the_sum_of_its_frames(scan) -> None:
 
 
 @pytest.mark.parametrize("method", ["sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista-tv"])
-def test_classical_methods_come_to_the_same_volume(on_ranks, scan, method) -> None:
+def test_classical_methods_come_to_the_same_volume(rt, on_ranks, scan, method) -> None:
     model = "log" if method == "cgls" else "intensity"
     options = method_options(method, None, {"iterations": 3, "motion": "per-row", "detector_model": model})
-    one = reconstruct(scan, RunPlan(method, options), Runtime()).volume
+    one = reconstruct(scan, RunPlan(method, options), rt).volume
     first: dict[int, np.ndarray] = {}
     for size in (3, 2, 3) if method == "sirt" else (3,):  # and once more
         volumes = [found.volume for found in on_ranks(size, method, options)]
@@ -77,9 +83,9 @@ def test_classical_methods_come_to_the_same_volume(on_ranks, scan, method) -> No
             np.testing.assert_array_equal(volume, first.setdefault(size, volumes[0]))
 
 
-def test_a_stopped_run_goes_on_with_another_number_of_ranks(on_ranks, scan) -> None:
-    options = replace(OPTIONS, iterations=76, control=replace(CONTROL, max_gaussians=400))
-    whole = reconstruct(scan, RunPlan("phyradgs", options, seed=1), Runtime())
+def test_a_stopped_run_goes_on_with_another_number_of_ranks(rt, on_ranks, scan) -> None:
+    options = replace(OPTIONS, iterations=64, control=replace(CONTROL, max_gaussians=400))
+    whole = reconstruct(scan, RunPlan("phyradgs", options, seed=1), rt)
 
     def stop(progress: Progress) -> None:
         raise KeyboardInterrupt

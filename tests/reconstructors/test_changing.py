@@ -119,14 +119,14 @@ def test_resumed_runs_have_the_same_bits(rt, scan) -> None:
 
 
 def test_computed_frames_and_held_out_pixels_are_those_of_the_states(rt, scan) -> None:
-    shown, plan = [], plan_run("changing", {"states": 5, "iterations": 20, "holdout": 2.0})
-    result = reconstruct(scan, plan, rt, report=lambda p: shown.append(p.frames(2)) if p.iteration == 20 else None)
+    shown, plan = [], plan_run("changing", {"states": 5, "iterations": 8, "holdout": 2.0})
+    result = reconstruct(scan, plan, rt, report=lambda p: shown.append(p.frames(2)) if p.iteration == 8 else None)
     assert max(pair.rms for pair in shown[0]) < 0.007  # 0.015 of the mean of the states
     titles = [re.search(r"RMS (.*) %", axes.get_title()) for axes in result.plot(scan, frame=2, device=rt).axes]
     (percent,) = (float(title[1]) for title in titles if title)
     assert percent < 0.7 * 100 * frame_pairs(rt, scan, result.volume, GRID, [2])[0].relative
     assert result.facts["held_out"]["holdout_rms"] < 0.007
-    resting = reconstruct(scan, plan_run("fista", {"iterations": 20, "holdout": 2.0}), rt)
+    resting = reconstruct(scan, plan_run("fista", {"iterations": 8, "holdout": 2.0}), rt)
     assert resting.facts["held_out"]["holdout_rms"] > 0.01
 
 

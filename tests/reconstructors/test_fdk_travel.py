@@ -97,7 +97,7 @@ def test_voxels_at_the_ends_have_the_mean_of_the_views_that_see_them(rt, axis, i
 @pytest.mark.parametrize("by_lines", [False, True])
 @pytest.mark.parametrize("geometry", [ParallelGeometry((1, 30), 0.05), ConeGeometry(10.0, 15.0, (1, 30), 0.075)])
 def test_rounding_does_not_hide_the_slice_of_a_single_row(rt, geometry, by_lines) -> None:
-    """It was 0, or had a fifth of its density, with the panel higher by 1e-12 mm in some views, or slices of 20 rows."""
+    """It was 0, or a fifth as dense, where the panel was higher by 1e-12 mm in some views, or slices had 20 rows."""
     row = np.sqrt(np.maximum(16 - (np.arange(30) - 14.5) ** 2, 0))
     frames, angle, volumes = np.tile(row.astype(np.float32), (40, 1, 1)), np.arange(40) * 2 * np.pi / 40, []
     for away_mm, slice_mm in ((0.0, 0.05), (1e-12, 0.05), (9e-5, 1.0)):

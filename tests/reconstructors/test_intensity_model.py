@@ -16,7 +16,7 @@ from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
 pytestmark = pytest.mark.slow
 
-ITERATIONS = {"os-sart": 8, "sirt": 25, "cgls": 8, "asd-pocs": 6, "fista": 8, "phyradgs exact": 500}
+ITERATIONS = {"os-sart": 8, "sirt": 25, "cgls": 8, "asd-pocs": 4, "fista": 4, "phyradgs exact": 500}
 VOXELS = [method for method in ITERATIONS if "phyradgs" not in method]
 GEOMETRY = ConeGeometry(5.0, 7.0, (24, 24), (4 / 24, 4 / 24))
 GRID = Grid.cube(16, 2.0)

@@ -99,7 +99,7 @@ def test_sart_and_sirt_are_their_definition(options) -> None:
 def test_fista_minimises_squares_weighed_by_light(rt) -> None:
     system, matrix, _ = dense_system(noise=1.0)
     system = system.transmission_weighted()
-    algorithm = stepped(FistaTv(system, FistaTvOptions(tv_weight=0.0), TvProx(rt, VOLUME)), 2000)
+    algorithm = stepped(FistaTv(system, FistaTvOptions(tv_weight=0.0), TvProx(rt, VOLUME)), 500)
     root = np.sqrt(system.transmission.ravel())
     expected, _ = nnls(root[:, None] * matrix, root * system.measured.ravel())
     plain, _ = nnls(matrix, system.measured.ravel())
@@ -148,7 +148,7 @@ def test_cgls_reaches_lsqr(noise) -> None:
 def test_fista_reaches_the_minimum_of_its_objective(rt) -> None:
     system, matrix, _ = dense_system(noise=0.5)
     options = FistaTvOptions(tv_weight=0.003, tv_iterations=20)
-    algorithm = stepped(FistaTv(system, options, TvProx(rt, VOLUME)), 300)
+    algorithm = stepped(FistaTv(system, options, TvProx(rt, VOLUME)), 100)
     weight = options.tv_weight * np.abs(matrix.T @ system.measured.ravel()).max()
     assert algorithm.tv_weight == pytest.approx(weight, rel=FLOAT32)
 
@@ -161,7 +161,7 @@ def test_fista_reaches_the_minimum_of_its_objective(rt) -> None:
 
     # plain proximal gradients in float64, with the exact norm and long inner solutions
     curvature, x = np.linalg.norm(matrix, 2) ** 2, np.zeros(VOLUME)
-    for _ in range(250):
+    for _ in range(150):
         gradient = (matrix.T @ (matrix @ x.ravel() - system.measured.ravel())).reshape(VOLUME)
         x = tv_prox(x - gradient / curvature, weight / curvature, 30, nonnegative=True)
     assert total_variation(x) > 0

@@ -58,16 +58,16 @@ def error(scan: Scan, volume: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize(("method", "changes", "share"), [
-    ("fista", {"iterations": 7}, 0.7), ("os-sart", {"iterations": 12}, 0.7), ("fdk", {"motion": "static"}, 0.8),
+    ("fista", {"iterations": 4}, 0.7), ("os-sart", {"iterations": 8}, 0.7), ("fdk", {"motion": "static"}, 0.8),
     ("fdk", {"motion": "per-row"}, 0.8), ("phyradgs", {"iterations": 240, "gaussians": 600}, 0.75),
-    ("r2", {"iterations": 150, "gaussians": 600}, 0.97),
 ])  # fmt: skip
 def test_the_reference_is_nearer_and_no_bit_is_other_where_nothing_moves(rt, scan, method, changes, share) -> None:
-    fields = None, breathing(), breathing(0.0)
-    ignored, moved, still = (reconstruct(scan, plan_of(method, field, **changes), rt) for field in fields)
+    ignored, moved = (reconstruct(scan, plan_of(method, field, **changes), rt) for field in (None, breathing()))
     assert error(scan, moved.volume) < share * error(scan, ignored.volume)
-    np.testing.assert_array_equal(still.volume, ignored.volume)
     assert moved.gaussians is None or moved.gaussians.count > 300
+    few = changes | ({"iterations": 8 if "gaussians" in changes else 2} if "iterations" in changes else {})
+    plain, still = (reconstruct(scan, plan_of(method, field, **few), rt) for field in (None, breathing(0.0)))
+    np.testing.assert_array_equal(still.volume, plain.volume)
 
 
 @pytest.mark.parametrize("method", ["cgls", "fista", "phyradgs"])
@@ -88,7 +88,7 @@ def test_runs_resume_to_the_same_bits(rt, scan, method, monkeypatch) -> None:
 
 
 def test_held_out_pixels_are_compared_with_the_object_as_it_was(rt, scan) -> None:
-    plans = (plan_of("fista", field, iterations=7, holdout=2.0) for field in (breathing(), None))
+    plans = (plan_of("os-sart", field, iterations=12, holdout=2.0) for field in (breathing(), None))
     moved, ignored = (reconstruct(scan, plan, rt).facts[HELD_OUT] for plan in plans)
     assert moved["holdout_rms"] < 0.75 * ignored["holdout_rms"]
 
