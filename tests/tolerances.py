@@ -18,7 +18,6 @@ CUTOFF_EDGE_SIGMA = 1e-4  # float32 may decide differently about pixels this clo
 CUTOFF_EDGE_NEEDLE = 1e-3  # across a needle a float32 position is a larger share of σ
 MERGED_FRAME = 1e-5  # Eq. 3 in one launch: a sum of splats, no other error than theirs (1e-6)
 BRUTE_FORCE = 1e-5  # per-line cells at the brute force's own times: the same sums in another order
-STANDING_PICTURE = 1e-5  # frames that must not depend on time differ by rounding alone
 # --- splats that move through a segment ------------------------------------------------------------------------
 # of the peak, against quadrature in time, with the rules' bound out of the way: float32 and the polynomial of erf
 SPLAT_MOVING = 1e-5  # measured 2e-6

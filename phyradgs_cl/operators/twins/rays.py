@@ -20,6 +20,7 @@ from phyradgs_cl.operators.twins.splat import moving_frame, precision_matrices, 
 _REACH = 2  # distance in voxels up to which a spline coefficient acts: points further than this outside the volume get 0
 _BORDER = 4  # width in voxels around the volume in which spline coefficients are kept
 _ROUNDING = 1e-3  # as ROUNDING of cl/common/line_backprojection.h, in pixels
+_NOWHERE = -9.0  # index of a sample outside every volume
 Volume = np.ndarray
 
 
@@ -30,8 +31,8 @@ def joseph_image(
     image = np.zeros(detector_shape)
     padded = np.pad(volume.astype(np.float64), 1)
     for index, points, step_mm in _rays(grid, pose, np.ones(detector_shape, bool), is_parallel):
-        samples = map_coordinates(padded, points[:, ::-1].T + 1, order=1, mode="constant")
-        image[index] = samples.sum() * step_mm
+        samples = map_coordinates(padded, np.moveaxis(points[..., ::-1], -1, 0) + 1, order=1, mode="constant")
+        image[index] = samples.sum(axis=-1) * step_mm
     return image
 
 
@@ -39,13 +40,14 @@ def joseph_adjoint(image: np.ndarray, grid: Grid, pose: np.ndarray, is_parallel:
     """Returns the transpose of ``joseph_image``: pixels (nv, nu) backprojected to a volume (nz, ny, nx)."""
     padded = np.zeros([n + 2 for n in grid.shape])
     for index, points, step_mm in _rays(grid, pose, image != 0, is_parallel):
-        touching = np.all((points > -1) & (points < grid.shape[::-1]), axis=1)
+        touching = np.all((points > -1) & (points < grid.shape[::-1]), axis=-1)
+        value = np.broadcast_to((image[index] * step_mm)[:, None], touching.shape)[touching]
         whole = np.floor(points[touching])
         rest = points[touching] - whole
         for corner in np.ndindex(2, 2, 2):
             share = np.prod(np.where(corner, rest, 1 - rest), axis=1)
             x, y, z = (whole + corner).astype(int).T + 1
-            np.add.at(padded, (z, y, x), float(image[index]) * step_mm * share)
+            np.add.at(padded, (z, y, x), value * share)
     return padded[1:-1, 1:-1, 1:-1]
 
 
@@ -104,22 +106,22 @@ def _lines(table: TimeCells, cell: int) -> tuple[slice, slice]:
 
 def _rays(
     grid: Grid, pose: np.ndarray, wanted: np.ndarray, is_parallel: bool
-) -> Iterator[tuple[tuple[int, ...], np.ndarray, float]]:
-    """Yields for each pixel in the mask ``wanted``: its index, sample points (n, 3) as voxel indices x y z, and the length
-    of ray per sample in mm."""
+) -> Iterator[tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]]:
+    """Yields for each axis the pixels in the mask ``wanted`` whose rays run mostly along it: their index, sample points
+    (pixels, n, 3) as voxel indices x y z, and the length of ray per sample (pixels,) in mm."""
     pitch, first = np.array(grid.voxel_size_mm[::-1]), np.array(grid.first_centre_mm[::-1])
     pixels = (pixel_centres(pose, wanted.shape) - first) / pitch
     source = (pose[:3] - first) / pitch
-    for index in zip(*np.nonzero(wanted), strict=True):
-        d = pose[:3] / pitch if is_parallel else pixels[index] - source
-        axis = int(np.argmax(np.abs(d)))
-        planes = np.arange(grid.shape[2 - axis])
-        if not is_parallel:
-            ends = np.sort([source[axis], pixels[index][axis]])
-            planes = planes[(planes >= ends[0]) & (planes <= ends[1])]
-        points = pixels[index] + np.outer((planes - pixels[index][axis]) / d[axis], d)
-        points[:, axis] = planes
-        yield index, points, float(np.linalg.norm(d * pitch) / abs(d[axis]))
+    directions = np.broadcast_to(pose[:3] / pitch, pixels.shape) if is_parallel else pixels - source
+    main = np.argmax(np.abs(directions), axis=-1)
+    for axis in range(3):
+        index = np.nonzero(wanted & (main == axis))
+        end, d, planes = pixels[index][:, None], directions[index][:, None], np.arange(grid.shape[2 - axis])
+        points = end + (planes[:, None] - end[..., [axis]]) / d[..., [axis]] * d
+        points[..., axis] = planes
+        if not is_parallel:  # planes beyond the source or the pixel have no sample
+            points[(planes - source[axis]) * (planes - end[..., axis]) > 0] = _NOWHERE
+        yield index, points, np.linalg.norm(d * pitch, axis=-1)[:, 0] / np.abs(d[:, 0, axis])
 
 
 def backprojection(
