@@ -158,9 +158,8 @@ def lines_backprojection(
         positions = [detector_position(p, grid, is_parallel, moved) for p in poses]
         u, v, depth = (np.stack(parts) for parts in zip(*positions, strict=True))
         ahead = v - np.arange(lines)[:, None, None, None]  # changes its sign at the line that sees the voxel
-        for index in np.ndindex(*grid.shape):
-            at = (slice(None), *index)
-            volume[index] += share * _seen(frame, u[at], ahead[at], depth[at], power, speed_power)
+        if lines > 1:
+            volume += share * _seen(frame, u, ahead, depth, power, speed_power)
     return volume
 
 
@@ -188,24 +187,28 @@ def detector_position(
 
 def _seen(
     frame: np.ndarray, u: np.ndarray, ahead: np.ndarray, depth: np.ndarray, power: int, speed_power: int
-) -> float:
-    """Returns what a frame adds to one voxel. u, ahead, depth (lines,), in the pose of each line: the voxel's pixel along
-    the line, the line onto which it is projected minus the pose's own line, and its depth. power, speed_power: exponents of
-    the depth, and of the rate at which the readout crosses the voxel's image."""
+) -> np.ndarray:
+    """Returns what a frame adds to each voxel, (nz, ny, nx). u, ahead, depth (lines, nz, ny, nx), in the pose of each line:
+    the voxel's pixel along the line, the line onto which it is projected minus the pose's own line, and its depth. power,
+    speed_power: exponents of the depth, and of the rate at which the readout crosses the voxel's image."""
     lines, width = frame.shape
+    low = np.arange(lines - 1)[:, None, None, None]
     speeds = ahead[:-1] - ahead[1:]
-    line_of_seen = np.arange(lines - 1) + ahead[:-1] / np.where(speeds > 0, speeds, np.nan)
-    off = np.abs(line_of_seen - np.clip(line_of_seen, np.arange(lines - 1), np.arange(1, lines)))
-    crossing = np.flatnonzero((off == 0) | (off <= _ROUNDING) & ((line_of_seen < 0) | (line_of_seen > lines - 1)))
-    if crossing.size == 0 or depth.min() <= 0:
-        return 0.0
-    line = int(crossing[0])
-    speed, t = speeds[line], np.clip(line_of_seen[line] - line, 0, 1)
+    line_of_seen = low + ahead[:-1] / np.where(speeds > 0, speeds, np.nan)
+    off = np.abs(line_of_seen - np.clip(line_of_seen, low, low + 1))
+    crossing = (off == 0) | (off <= _ROUNDING) & ((line_of_seen < 0) | (line_of_seen > lines - 1))
+    sees, line = crossing.any(axis=0) & (depth.min(axis=0) > 0), np.argmax(crossing, axis=0)
+
+    def at(values: np.ndarray, number: np.ndarray) -> np.ndarray:  # 1 where the frame does not see the voxel
+        return np.where(sees, np.take_along_axis(values, number[None], axis=0)[0], 1.0)
+
+    speed, t = at(speeds, line), np.clip(at(line_of_seen, line) - line, 0, 1)
     here, there = (
-        float(np.interp(u[r], np.arange(width), frame[r])) * bool(_on(u[r], width)) for r in (line, line + 1)
+        map_coordinates(frame, [number, x], order=1, mode="nearest") * _on(x, width)
+        for number, x in ((number, at(u, number)) for number in (line, line + 1))
     )
-    middle = (1 - t) * depth[line] + t * depth[line + 1]
-    return float(((1 - t) * here + t * there) / (middle**power * speed**speed_power))
+    middle = (1 - t) * at(depth, line) + t * at(depth, line + 1)
+    return np.where(sees, ((1 - t) * here + t * there) / (middle**power * speed**speed_power), 0.0)
 
 
 def _on(position: np.ndarray, count: int) -> np.ndarray:

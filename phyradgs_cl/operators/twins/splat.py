@@ -13,6 +13,7 @@ of the parabola through the projections at both ends and in the middle. The coni
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -219,10 +220,9 @@ def _segment_image(
     if affine:
         ray = (row[:3] - pose[:3]) / seen_at(pose, row[:3])[2]
     length = np.linalg.norm(pose[:3] if is_parallel else ray, axis=-1)
-    mean = np.zeros(shape)
-    for share, weight in zip(*_nodes(), strict=True):
-        at = times[0] + share * times[1]
-        mean += weight * np.exp(-_exponent(s, delta, at[:, None], big_q) / 2)
+    share, weight = _nodes()
+    at = times[0] + share[:, None] * times[1]  # (nodes, lines)
+    mean = np.tensordot(weight, np.exp(-_exponent(s, delta, at[..., None], big_q) / 2), 1)
     value = times[2][:, None] * length * s.amplitude / np.sqrt(big_q) * mean
     return (
         np.where(_nearest(s, delta, times, big_q) <= cutoff_sigma**2, value, 0.0) if cutoff_sigma else value
@@ -230,10 +230,10 @@ def _segment_image(
 
 
 def _exponent(s: _Segment, delta: np.ndarray, at: np.ndarray, big_q: np.ndarray) -> np.ndarray:
-    """Returns the exponent q (lines, width) when the centre has moved from its average place by ``at`` (lines, 1 or width)
-    times the path."""
-    moved = delta - at[..., None] * s.path
-    return np.asarray(np.einsum("...i,ij,...j", moved, s.conic, moved) / big_q)
+    """Returns the exponent q (..., lines, width) when the centre has moved from its average place by ``at`` times the path.
+    at: (..., lines, 1) or of the result's shape."""
+    u, v = (delta[..., k] - at * s.path[k] for k in (0, 1))
+    return np.asarray((s.conic[0, 0] * u**2 + 2 * s.conic[0, 1] * u * v + s.conic[1, 1] * v**2) / big_q)
 
 
 def _nearest(s: _Segment, delta: np.ndarray, times: np.ndarray, big_q: np.ndarray) -> np.ndarray:
@@ -244,6 +244,7 @@ def _nearest(s: _Segment, delta: np.ndarray, times: np.ndarray, big_q: np.ndarra
     return _exponent(s, delta, np.clip(best, first, last), big_q)
 
 
+@cache
 def _nodes() -> tuple[np.ndarray, np.ndarray]:
     """Returns the nodes of a composite Gauss–Legendre rule on [−1, 1], and its weights, which sum to 1."""
     node, weight = np.polynomial.legendre.leggauss(_NODES)
