@@ -147,13 +147,16 @@ def test_logarithms_with_flats_of_ones_are_refused() -> None:
     np.testing.assert_allclose(transmitted.projections, frames, atol=1e-6)
 
 
-def test_a_clockwise_gantry_is_the_mirror_of_the_other() -> None:
+def test_a_clockwise_gantry_is_the_mirror_of_the_other_and_two_turns_see_every_angle_twice() -> None:
     one, other = (Protocol(views=10, exposure_deg=14.0, start_deg=0.0, turns=turns) for turns in (1.0, -1.0))
     np.testing.assert_array_equal(one.frame_start_s(), other.frame_start_s())
     time_s = np.array([0.3, 0.9])
     for frame in (0, 4):
         angles = [p.orbit(CONE).kinematics.angle_rad(frame, p.frame_start_s()[frame] + time_s) for p in (one, other)]
         np.testing.assert_allclose(angles[0], -angles[1])
+    twice = Protocol(views=8, exposure_deg=45.0, turns=2.0)
+    np.testing.assert_allclose(np.rad2deg(twice.angle_start_rad()), np.arange(8) * 90.0)
+    assert twice.window_s() == (0.0, pytest.approx(14.0 + 1.86)) and twice.at_rate(2.0).exposure_s == pytest.approx(0.25)
     for turns in (0.0, 1e-4, np.nan):
         with pytest.raises(InputError, match="--turns"):
             Protocol(turns=turns)

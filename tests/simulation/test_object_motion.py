@@ -194,13 +194,6 @@ def test_objects_that_move_fast_are_sampled_finely() -> None:
     assert moving_sphere(1.0, period_s=2.0).fastest_mm_per_s == pytest.approx(0.25)
 
 
-def test_two_turns_see_every_angle_twice() -> None:
-    twice = Protocol(views=8, exposure_deg=45.0, turns=2.0)
-    np.testing.assert_allclose(np.rad2deg(twice.angle_start_rad()), np.arange(8) * 90.0)
-    assert twice.window_s() == (0.0, pytest.approx(14.0 + 1.86))
-    assert twice.at_rate(2.0).exposure_s == pytest.approx(0.25)
-
-
 @pytest.mark.parametrize("beam", ["cone", "parallel"])
 def test_lines_see_a_moving_sphere_where_it_is(rt, beam) -> None:
     """RTK's sphere, written out line by line; its states are those of the frames of a cycle."""
