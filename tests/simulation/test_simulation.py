@@ -28,11 +28,6 @@ def run(options: SimulationOptions, phantom: EllipsoidPhantom = PHANTOM, **more:
     return simulate(AnalyticSource(phantom, GEOMETRY), GEOMETRY, GRID, options, **more)
 
 
-def integrals(angle_rad: float) -> np.ndarray:
-    pose = GEOMETRY.pose(angle_rad)
-    return PHANTOM.line_integrals(pose[:3], pixel_centres(pose, SHAPE))
-
-
 @pytest.mark.parametrize(("axis", "direction"), [("rows", 1), ("columns", -1)])
 @pytest.mark.parametrize("model", ["log", "intensity"])
 def test_every_line_averages_over_its_own_window_and_every_pixel_over_its_area(rt, axis, direction, model) -> None:
@@ -116,7 +111,8 @@ def test_a_pulse_freezes_what_it_lights() -> None:
     assert scan.shutter.pulse_s == (0.8, 1e-6)
     np.testing.assert_allclose(scan.middle_times_s, scan.frame_start_s + 0.8, atol=1e-6)
     lit = np.flatnonzero(np.arange(SHAPE[0]) / (SHAPE[0] - 1) * 1.5 < 0.8)
-    expected = integrals(np.deg2rad(120.0 + 0.8 * 12.0))
+    pose = GEOMETRY.pose(np.deg2rad(120.0 + 0.8 * 12.0))
+    expected = PHANTOM.line_integrals(pose[:3], pixel_centres(pose, SHAPE))
     np.testing.assert_allclose(scan.projections[1][lit], expected[lit], rtol=0, atol=1e-4)
     dark = np.setdiff1d(np.arange(SHAPE[0]), lit)
     assert not scan.projections[:, dark].any() and scan.pixel_mask[dark].all() and not scan.pixel_mask[lit].any()
