@@ -156,7 +156,8 @@ def test_a_clockwise_gantry_is_the_mirror_of_the_other_and_two_turns_see_every_a
         np.testing.assert_allclose(angles[0], -angles[1])
     twice = Protocol(views=8, exposure_deg=45.0, turns=2.0)
     np.testing.assert_allclose(np.rad2deg(twice.angle_start_rad()), np.arange(8) * 90.0)
-    assert twice.window_s() == (0.0, pytest.approx(14.0 + 1.86)) and twice.at_rate(2.0).exposure_s == pytest.approx(0.25)
+    assert twice.window_s() == (0.0, pytest.approx(14.0 + 1.86))
+    assert twice.at_rate(2.0).exposure_s == pytest.approx(0.25)
     for turns in (0.0, 1e-4, np.nan):
         with pytest.raises(InputError, match="--turns"):
             Protocol(turns=turns)

@@ -152,7 +152,8 @@ def test_the_kernel_is_its_twin_and_the_twin_the_textbooks(any_rt) -> None:
     adam = DeviceAdam(any_rt, Activation(0.01, 0.5))
     theta, moments = raw, np.zeros((2, *raw.shape))
     for step in range(1, 7):
-        by, g = np.zeros((13, stride), np.float32), rng.normal(size=(11, 19)) * 10.0 ** rng.uniform(-6, 0, (11, 19))
+        by = np.zeros((13, stride), np.float32)
+        g = rng.normal(size=(11, 19)) * 10.0 ** rng.uniform(-6, 0, (11, 19))
         by[:11, :19] = np.where(rng.uniform(size=g.shape) < 0.1, 0, g)
         gradients.append(g := by[:11, :19].astype(float))
         adam.step(device_raw, any_rt.upload(by), device_moments, stride, RATES, step)
