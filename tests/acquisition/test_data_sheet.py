@@ -48,10 +48,8 @@ def test_a_simulation_takes_a_data_sheet() -> None:
 
 
 def test_numbers_that_hardly_a_scanner_has_are_warned_of(caplog) -> None:
-    opaque, high, tall = FRAMES.copy(), np.full((12, 120, 8), 0.5, np.float32), replace(CONE, detector_shape=(120, 8))
-    opaque[..., :2] = 60.0
+    high, tall = np.full((12, 120, 8), 0.5, np.float32), replace(CONE, detector_shape=(120, 8))
     for words, make, args, more in (
-        ("line integrals of up to 60: .* counts", static_scan, (opaque, CONE), {"quantity": "attenuation"}),
         ("^readout_ratio: readout of 0.1 s, 1.5 times", fly_scan, (FRAMES, CONE), SHEET | {"readout_ratio": 100 / 60}),
         ("^readout_ratio: readout of 0.06 ms for 120 .*unit", fly_scan, (high, tall), SHEET | {"readout_ratio": 1e-3}),
         ("^exposure_s: 1.5 fps and 30° from frame to frame", fly_scan, (FRAMES, CONE), RIGHT | {"exposure_deg": 2.7}),
@@ -69,7 +67,7 @@ def test_masked_pixels_do_not_hide_opaque_ones(caplog) -> None:
     mask[:, :5], frames[:, 0, 0] = 0, 60.0
     geometry = replace(CONE, detector_shape=(10, 50))
     static_scan(frames, geometry, TURN_DEG, quantity="attenuation", mask=mask)
-    assert "line integrals of up to 60" in caplog.text
+    assert re.search("line integrals of up to 60: .* counts", caplog.text)
     with pytest.raises(InputError, match="frames: found values of up to 60"):
         static_scan(frames, geometry, TURN_DEG, mask=mask)
 

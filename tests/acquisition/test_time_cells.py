@@ -1,4 +1,4 @@
-"""Time cells of every motion model: weights, times (Eq. 2 of the paper), lines and poses."""
+"""Time cells of every motion model: weights, times (Eq. 2 of the paper), lines and poses; what of them a pulse lights."""
 
 from dataclasses import replace
 from itertools import product
@@ -6,9 +6,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import Scan, Shutter
+from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, Shutter
 from phyradgs_cl.acquisition.cells import exact_cells, micro_view_cells, per_line_cells, segments_for
-from phyradgs_cl.acquisition.geometry import ConeGeometry
 from phyradgs_cl.acquisition.motion import (
     LINE_POSES,
     MODELS,
@@ -40,13 +39,15 @@ SPEED_RAD_PER_S = 0.25
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, SPEED_RAD_PER_S))
 START_S = 3.0
 TIME_TOLERANCE_S = 1e-12
+DARK_FROM = Shutter(0.8, 1.2, pulse_s=(0.1, 0.9))  # the last lines open after 1.0 s
 
 
 @pytest.mark.parametrize("axis", ["rows", "columns"])
 @pytest.mark.parametrize("direction", [1, -1])
-def test_cells_have_the_times_of_eq_2_on_every_line(axis, direction) -> None:
-    """Micro-views those of its strip, cells of one line (here: no strips) those of its own exposure."""
-    shutter = Shutter(0.8, 0.3, axis, direction)
+@pytest.mark.parametrize("pulse_s", [None, (0.25, 0.7)])
+def test_cells_have_the_times_of_eq_2_on_every_line(axis, direction, pulse_s) -> None:
+    """Micro-views those of its strip, cells of one line (here: no strips) those of its own exposure, as far as it is lit."""
+    shutter = Shutter(0.8, 0.3, axis, direction, pulse_s)
     lines = shutter.lines(SHAPE)
     where = (ORBIT, shutter, 0, START_S, lines)
     for strips, times in [*product([1, 2, 3, 7, 8, 10, 25], [1, 3, 5]), (None, 1), (None, 4)]:
@@ -59,16 +60,19 @@ def test_cells_have_the_times_of_eq_2_on_every_line(axis, direction) -> None:
         for line in range(lines):
             order = line if direction > 0 else lines - 1 - line
             opens = (order * strips // lines + 0.5) / strips if strips else order / (lines - 1)
-            expected_s = START_S + 0.3 * opens + (np.arange(times) + 0.5) / times * 0.8
+            first_s, last_s = (0.3 * opens + np.array([0.0, 0.8])).clip(*((0.25, 0.95) if pulse_s else (0.0, 2.0)))
+            expected_s = START_S + first_s + (np.arange(times) + 0.5) / times * (last_s - first_s)
             serving = (cells.line_start <= line) & (line < cells.line_stop)
             np.testing.assert_allclose(np.sort(cells.time_s[serving]), expected_s, atol=TIME_TOLERANCE_S)
             np.testing.assert_allclose(cells.weight[serving], 1 / times)
 
 
-def scan(is_fly: bool) -> Scan:
-    shutter, start_s = Shutter(0.8, 0.3, "columns"), np.array([0.0, START_S])
-    frames = np.zeros((2, *SHAPE), np.float32)
-    return Scan(frames, GEOMETRY, ORBIT, shutter, start_s, Grid.cube(4, 2.0), is_fly=is_fly)
+COLUMNS = Shutter(0.8, 0.3, "columns")
+
+
+def scan(is_fly: bool, shutter: Shutter = COLUMNS, **changes: object) -> Scan:
+    frames, start_s = np.zeros((2, *SHAPE), np.float32), np.array([0.0, START_S])
+    return Scan(frames, GEOMETRY, ORBIT, shutter, start_s, Grid.cube(4, 2.0), is_fly=is_fly, **changes)
 
 
 def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
@@ -169,3 +173,74 @@ def test_without_a_number_segments_follow_from_the_time_error() -> None:
         found = Exact(time_error=0.001).cells(fly, 1, peak)
         np.testing.assert_array_equal(found.line_times, expected.line_times)
         np.testing.assert_array_equal(found.pose, expected.pose)
+
+
+def test_a_window_is_cut_by_the_pulse_or_missed() -> None:
+    shutter = Shutter(0.8, 0.6, pulse_s=(0.3, 0.7))
+    expected = [[max(0.1 * r, 0.3), min(0.1 * r + 0.8, 1.0)] for r in range(7)]
+    np.testing.assert_allclose(shutter.line_windows_s(7), expected, atol=TIME_TOLERANCE_S)
+    assert shutter.lit_span_s == pytest.approx((0.3, 1.0)) and shutter.middle_s == pytest.approx(0.65)
+    seen = np.diff(expected)[:, 0]
+    np.testing.assert_allclose(shutter.lit_share(7), seen / seen.max(), rtol=1e-12)
+    windows_s, share = DARK_FROM.line_windows_s(7), DARK_FROM.lit_share(7)
+    np.testing.assert_array_equal(share > 0, [True] * 5 + [False] * 2)  # line 5 opens at 1.0 s
+    np.testing.assert_array_equal(windows_s[5:], 1.0)
+    assert Shutter(1.0, 0.5).delay_s(1) == Shutter(1.0, 0.5, direction=-1).delay_s(1) == 0  # a panel of one line
+
+
+def test_a_billionth_of_a_window_is_rounding() -> None:
+    """The last line opens when the pulse has all but ended."""
+    for exposure_s, (seen, share) in product((1.0, 4.0), [(0.5e-9, 0.0), (1.5e-9, 1.5e-9)]):
+        lit = Shutter(exposure_s, exposure_s, pulse_s=(0.0, exposure_s * (1 + seen))).lit_share(3)
+        np.testing.assert_allclose(lit, [1.0, 0.5, share], rtol=1e-6)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_every_time_lies_in_the_pulse_and_weights_stay_whole(direction) -> None:
+    pulsed = scan(True, replace(DARK_FROM, direction=direction))
+    tables = [motion.cells(pulsed, 1) for motion in (MicroViews(4, 3), OwnTimes(3), Static(), StaticStart())]
+    for cells in tables:
+        np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
+        assert cells.time_s.min() >= START_S + 0.1 - TIME_TOLERANCE_S
+        assert cells.time_s.max() <= START_S + 1.0 + TIME_TOLERANCE_S
+    middle, start = tables[2:]  # of the light
+    assert (middle.time_s[0], start.time_s[0]) == pytest.approx((START_S + 0.55, START_S + 0.1))
+
+
+def test_dark_lines_join_the_mask_of_a_scan() -> None:
+    assert scan(True, Shutter(0.8, 1.2)).pixel_mask is None
+    expected = np.zeros(SHAPE, bool)
+    expected[5:] = True
+    np.testing.assert_array_equal(scan(True, DARK_FROM).pixel_mask, expected)
+    own = np.zeros((2, *SHAPE), np.int32)
+    own[1, 2, 3] = 64
+    found = scan(True, DARK_FROM, pixel_mask=own).pixel_mask
+    np.testing.assert_array_equal(found, (own != 0) | expected)
+    by_column = scan(True, Shutter(0.8, 1.8, "columns", -1, (0.0, 0.5))).pixel_mask
+    assert by_column[:, :7].all() and not by_column[:, 7:].any()  # column 6 opens at 0.6 s
+
+
+@pytest.mark.parametrize("is_fly", [True, False])
+def test_a_pulsed_scan_knows_when_it_needs_a_pose(is_fly) -> None:
+    pulsed = scan(is_fly, DARK_FROM)
+    pulsed.check_timing()
+    assert Static().cells(pulsed, 1).time_s[0] == pytest.approx(START_S + 0.55)
+    # a protocol pulses in shares of the exposure
+    protocol = Protocol(views=4, exposure_deg=10.0, readout_ratio=0.5, pulse=(0.5, 0.4), is_fly=is_fly)
+    angle = protocol.orbit(GEOMETRY).angle_rad(1, protocol.frame_start_s()[1] + np.array([0.7]))
+    assert np.rad2deg(angle[0]) == pytest.approx(97.0)  # moving there, or standing there
+
+
+def test_pulses_that_no_frame_sees_are_refused() -> None:
+    for pulse in [
+        (0.0, 0.0), (0.2, 0.0), (0.0, -1.0), (0.2, -0.1), (1.5, 1.0), (2.0, 1.0), (-0.5, 0.5), (-3.0, 1.0),
+        (np.nan, 1.0), (0.0, np.inf), "0.2,0.5", 0.5, (0.1, 0.2, 0.3),
+    ]:  # fmt: skip
+        with pytest.raises(InputError, match="pulse"):
+            Protocol(readout_ratio=0.5, pulse=pulse)
+        with pytest.raises(InputError, match="pulse_s"):
+            Shutter(1.0, 0.5, pulse_s=pulse)
+    for pulse in ((-0.5, 0.6), (1.4, 5.0)):  # that meet the window are kept
+        assert Protocol(readout_ratio=0.5, pulse=pulse).shutter().pulse_s == pulse
+    with pytest.raises(InputError, match="no line is open"):
+        Shutter(0.1, 10.0, pulse_s=(0.5, 0.2)).lit_share(3)

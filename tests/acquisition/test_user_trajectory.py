@@ -63,9 +63,3 @@ def test_angles_of_no_use_are_refused(angle) -> None:
 
     with pytest.raises(InputError, match="kinematics Kinematics"):
         scan_of(CircularOrbit(CONE, Kinematics())).trajectory.pose(0, np.zeros(2))
-
-
-def test_a_grid_is_divided_by_whole_numbers_into_three_sides() -> None:
-    for made in (lambda: Grid.cube(8, 1.0).in_shape(4), lambda: Grid.cube(8, 1.0).finer(0)):  # type: ignore[arg-type]
-        with pytest.raises(InputError):
-            made()

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, GridChoice
 
 SHIFTED = Grid((2, 3, 4), (1.0, 2.0, 3.0), (10.0, 20.0, 30.0))
@@ -15,10 +15,8 @@ def test_centres_are_symmetric_about_the_offset() -> None:
     np.testing.assert_allclose(y, [18, 20, 22])
     np.testing.assert_allclose(x, [25.5, 28.5, 31.5, 34.5])
     assert SHIFTED.first_centre_mm == (9.5, 18.0, 25.5)
-    assert SHIFTED.size_mm == (2.0, 6.0, 12.0)
-    assert SHIFTED.half_longest_mm == 6.0
-    cube = Grid.cube(4, 8.0)
-    assert cube == Grid((4, 4, 4), (2.0, 2.0, 2.0))
+    assert SHIFTED.size_mm == (2.0, 6.0, 12.0) and SHIFTED.half_longest_mm == 6.0
+    assert Grid.cube(4, 8.0) == Grid((4, 4, 4), (2.0, 2.0, 2.0))
     scaled = SHIFTED.scaled(0.5)
     assert scaled.shape == SHIFTED.shape
     for fine, coarse in zip(scaled.axes_mm(), SHIFTED.axes_mm(), strict=True):
@@ -67,5 +65,7 @@ def test_a_part_of_a_grid_knows_its_place_and_a_margin_is_whole_voxels_around_th
         assert wide.shape == shape and wide.offset_mm == pytest.approx(GRID.offset_mm), margin_mm
         assert GRID.slices_in(wide) is not None
     assert GridChoice(size=5).with_margin(GRID) is GRID
-    with pytest.raises(InputError, match="--margin-mm: found a grid of"):
-        GridChoice(margin_mm=1e8).with_margin(GRID)
+    assert_refused({
+        "--margin-mm: found a grid of": lambda: GridChoice(margin_mm=1e8).with_margin(GRID),
+        "shape: found shape": lambda: GRID.in_shape(4), "parts: found 0": lambda: GRID.finer(0),  # type: ignore[arg-type]
+    })  # fmt: skip

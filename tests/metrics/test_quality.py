@@ -36,7 +36,7 @@ def _reference_map(image: np.ndarray, truth: np.ndarray, data_range: float) -> n
 
 
 @pytest.mark.parametrize("data_range", [None, 1.0])
-def test_ssim_is_scikit_images_up_to_the_border_and_a_mean_over_slices_that_are_not_empty(data_range) -> None:
+def test_ssim_is_scikit_images_up_to_the_border_and_a_mean_over_slices_that_are_not_empty(data_range, monkeypatch) -> None:
     result, truth = _two_stacks()
     expected = np.stack([_reference_map(a, b, 1.3) for a, b in zip(result, truth, strict=True)])
     assert np.allclose(ssim_map(result, truth, 1.3), expected, atol=1e-10)
@@ -44,14 +44,9 @@ def test_ssim_is_scikit_images_up_to_the_border_and_a_mean_over_slices_that_are_
     for axis in range(3):
         slices = zip(np.moveaxis(result, axis, 0), np.moveaxis(truth, axis, 0), strict=True)
         means.append(np.mean([_reference_map(a, b, peak).mean() for a, b in slices if b.any()]))
-    assert ssim(result, truth, data_range) == pytest.approx(np.mean(means), abs=1e-10)
-
-
-def test_batches_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
-    result, truth = _two_stacks()
-    whole = ssim(result, truth)
+    assert (whole := ssim(result, truth, data_range)) == pytest.approx(np.mean(means), abs=1e-10)
     monkeypatch.setattr(import_module("phyradgs_cl.metrics.quality"), "_VOXELS_PER_BATCH", 700)
-    assert ssim(result, truth) == pytest.approx(whole, rel=1e-13)
+    assert ssim(result, truth, data_range) == pytest.approx(whole, rel=1e-13)  # batches do not show
 
 
 def test_compare_uses_the_references_maximum_and_metrics_are_printed_with_their_units() -> None:

@@ -42,9 +42,12 @@ def test_the_term_is_the_mean_difference_along_every_axis(finite_differences) ->
 @pytest.mark.parametrize("shape", SHAPES + STATES)
 @pytest.mark.parametrize("nonnegative", [True, False])
 def test_proximal_kernels_are_their_twin(two_rt, shape, nonnegative) -> None:
-    """Of a volume, and of states of one."""
+    """Of a volume, and of states of one. No weight only clips."""
     volume, weights = random_weights(shape), SKEWED if len(shape) == 3 else (2.0, *SKEWED)
-    found = TvProx(two_rt, shape, weights)(volume.astype(np.float32), 0.3, 12, nonnegative=nonnegative)
+    prox, rounded = TvProx(two_rt, shape, weights), volume.astype(np.float32)
+    clipped = np.maximum(rounded, 0) if nonnegative else rounded
+    np.testing.assert_array_equal(prox(rounded, 0.0, 5, nonnegative=nonnegative), clipped)
+    found = prox(rounded, 0.3, 12, nonnegative=nonnegative)
     expected = tv_prox(volume, 0.3, 12, nonnegative=nonnegative, axis_weights=weights)
     np.testing.assert_allclose(found, expected, rtol=0, atol=TV_MAP)
 
@@ -96,18 +99,11 @@ def test_the_dual_goes_on_where_the_last_call_left_it(rt) -> None:
     np.testing.assert_array_equal(once, again)
 
 
-def test_no_weight_only_clips_and_a_flat_volume_stays(rt) -> None:
-    volume, flat = random_weights((3, 4, 5)).astype(np.float32), np.full((4, 5, 6), 2.5, np.float32)
-    prox = TvProx(rt, volume.shape)
-    np.testing.assert_array_equal(prox(volume, 0.0, 5, nonnegative=True), np.maximum(volume, 0))
-    np.testing.assert_array_equal(prox(volume, 0.0, 5, nonnegative=False), volume)
-    np.testing.assert_array_equal(TvDescent(rt, flat.shape)(flat, 0.1, 3), flat)
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_descent_kernel_is_its_twin(two_rt, shape) -> None:
-    volume = random_weights(shape)
+    volume, flat = random_weights(shape), np.full(shape, 2.5, np.float32)
     before, descent = volume.copy(), TvDescent(two_rt, shape)
+    np.testing.assert_array_equal(descent(flat, 0.1, 3), flat)
     np.testing.assert_allclose(descent.gradient(volume), tv_gradient(volume), rtol=0, atol=TV_MAP)
     np.testing.assert_allclose(descent(volume, 0.05, 5), tv_descent(volume, 0.05, 5), rtol=0, atol=TV_MAP)
     np.testing.assert_array_equal(volume, before)  # the caller keeps his

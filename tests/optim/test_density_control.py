@@ -130,21 +130,7 @@ def test_when_it_acts_and_rates_decay_exponentially() -> None:
     np.testing.assert_allclose(middle, np.sqrt(first * last), rtol=FLOAT64)
 
 
-STEPS = 6
 RATES = np.array([1e-2] * 3 + [2e-2] * 3 + [5e-3] * 4 + [3e-2])
-
-
-@pytest.fixture
-def problem() -> tuple[np.ndarray, list[np.ndarray]]:
-    """Raw parameters (11, 19) and gradients over six decades, some of them exactly zero."""
-    rng = np.random.default_rng(91)
-    raw = rng.normal(size=(11, 19)).astype(np.float32).astype(float)
-    gradients = []
-    for _ in range(STEPS):
-        g = rng.normal(size=(11, 19)) * 10.0 ** rng.uniform(-6, 0, (11, 19))
-        g[rng.uniform(size=g.shape) < 0.1] = 0
-        gradients.append(g.astype(np.float32).astype(float))
-    return raw, gradients
 
 
 def textbook(raw: np.ndarray, gradients: list[np.ndarray]) -> np.ndarray:
@@ -157,29 +143,24 @@ def textbook(raw: np.ndarray, gradients: list[np.ndarray]) -> np.ndarray:
     return theta
 
 
-def test_twin_is_the_textbooks(problem) -> None:
-    raw, gradients = problem
-    theta, moments = raw, np.zeros((2, *raw.shape))
-    for step, g in enumerate(gradients, start=1):
-        theta, moments = adam_step(theta, g, moments, RATES, step)
-    np.testing.assert_allclose(theta, textbook(raw, gradients), rtol=0, atol=ADAM_TEXTBOOK * RATES.max())
-
-
-def test_kernel_is_its_twin(any_rt, problem) -> None:
-    raw, gradients = problem
-    stride = 32
+def test_the_kernel_is_its_twin_and_the_twin_the_textbooks(any_rt) -> None:
+    """Gradients are of six decades, some of them exactly zero."""
+    rng, stride, gradients = np.random.default_rng(91), 32, []
     padded = np.zeros((11, stride), np.float32)
-    padded[:, :19] = raw
+    padded[:, :19] = raw = rng.normal(size=(11, 19)).astype(np.float32).astype(float)
     device_raw, device_moments = any_rt.upload(padded), any_rt.zeros((2, 11, stride))
     adam = DeviceAdam(any_rt, Activation(0.01, 0.5))
     theta, moments = raw, np.zeros((2, *raw.shape))
-    for step, g in enumerate(gradients, start=1):
+    for step in range(1, 7):
         by = np.zeros((13, stride), np.float32)
-        by[:11, :19] = g
+        g = rng.normal(size=(11, 19)) * 10.0 ** rng.uniform(-6, 0, (11, 19))
+        by[:11, :19] = np.where(rng.uniform(size=g.shape) < 0.1, 0, g)
+        gradients.append(g := by[:11, :19].astype(float))
         adam.step(device_raw, any_rt.upload(by), device_moments, stride, RATES, step)
         theta, moments = adam_step(theta, g, moments, RATES, step)
         moved = any_rt.download(device_raw)[:, :19] - raw
         np.testing.assert_allclose(moved, theta - raw, rtol=0, atol=ADAM_KERNEL * RATES.max())
+    np.testing.assert_allclose(theta, textbook(raw, gradients), rtol=0, atol=ADAM_TEXTBOOK * RATES.max())
     found = any_rt.download(device_moments)[:, :, :19]
     np.testing.assert_allclose(found[0], moments[0], rtol=FLOAT32)
     np.testing.assert_allclose(found[1], moments[1], rtol=ADAM_SECOND_MOMENT)

@@ -16,11 +16,6 @@ from phyradgs_cl.runtime import DeviceSpace, Runtime, context
 GPU = {"lanes": 1, "pixel_items": True}
 
 
-@pytest.fixture
-def parts(monkeypatch):
-    return launches(monkeypatch)
-
-
 def test_a_kernel_that_allows_hardly_any_items_is_named(monkeypatch) -> None:
     rt = Runtime(**GPU)
     monkeypatch.setattr(Runtime, "_asked", lambda *_: 8)
@@ -47,8 +42,8 @@ def test_threads_launch_the_same_kernel_with_their_own_arguments(rt, monkeypatch
     ((64, 5), (64, 1)), ((16, 16, 16), (16, 4, 1)), ((16, 6, 4), (16, 2, 2)), ((17, 4), (32, 2)),
     ((5, 3), (64, 1)), ((3,), (64,)),
 ])  # fmt: skip
-def test_a_gpu_group_fills_other_axes_where_the_first_is_short(parts, shape, sides) -> None:
-    rt = Runtime(**GPU)
+def test_a_gpu_group_fills_other_axes_where_the_first_is_short(monkeypatch, shape, sides) -> None:
+    rt, parts = Runtime(**GPU), launches(monkeypatch)
     rt.launch(rt.kernel("rates", "multiply_add"), shape, 3, 0.5, rt.zeros(64), group=64)
     rt.launch(rt.kernel("rates", "multiply_add"), shape, 3, 0.5, rt.zeros(64), group=(64,))
     assert [group for *_, group, _ in parts] == [sides, (64, *([1] * (len(shape) - 1)))]

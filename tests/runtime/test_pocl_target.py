@@ -57,15 +57,13 @@ def test_nothing_is_changed_where_the_record_is_not_understood(record, monkeypat
     put(400, b"generic")
     put(600, TRIPLE)
     put(616, b"generic")
-    before = bytes(memory)
     assert pocl.use_library_target(ctypes.addressof(memory)) is None
     put(608, b"generic")
     before = bytes(memory)
-    monkeypatch.setattr(pocl.platform, "system", lambda: "Darwin")
-    assert pocl.use_library_target(ctypes.addressof(memory)) is None
-    monkeypatch.setattr(pocl.platform, "system", lambda: "Linux")
-    monkeypatch.setattr(pocl, "library_target", lambda: None)
-    assert pocl.use_library_target(ctypes.addressof(memory)) is None
+    for system, target in (("Darwin", "haswell"), ("Linux", None)):
+        monkeypatch.setattr(pocl.platform, "system", lambda system=system: system)
+        monkeypatch.setattr(pocl, "library_target", lambda target=target: target)
+        assert pocl.use_library_target(ctypes.addressof(memory)) is None
     assert bytes(memory) == before
 
 

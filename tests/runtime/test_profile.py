@@ -1,17 +1,12 @@
 """Where device time goes: what is counted, and the table that says so."""
 
 import numpy as np
-import pytest
 
 from phyradgs_cl.runtime import KernelUse, Runtime, profile_text
 
 
-@pytest.fixture(scope="module")
-def profiled() -> Runtime:
-    return Runtime(profile=True)
-
-
-def test_launches_time_and_bytes_are_counted_by_kernel_and_long_runs_do_not_keep_every_event(profiled, monkeypatch) -> None:
+def test_launches_time_and_bytes_are_counted_by_kernel_and_long_runs_do_not_keep_every_event(monkeypatch) -> None:
+    profiled = Runtime(profile=True)
     source = profiled.upload(np.ones(1000, np.float32))
     target = profiled.zeros(1000)
     profiled.kernel_uses()

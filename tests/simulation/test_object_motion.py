@@ -1,7 +1,6 @@
 """Objects that move while they are scanned: every line sees them where they are at its own times."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -173,16 +172,12 @@ def test_states_stand_in_one_breath_or_over_the_whole_scan() -> None:
     ('kind = "drying"\nperiod_s = 3.0', "period_s"), ('kind = "breathing"\nstates = 2.5', "states"),
     ('kind = "breathing"\namplitude = 0.1\namplitude_mm = 3', "amplitude"),
 ])  # fmt: skip
-def test_wrong_files_are_named_in_one_line(tmp_path: Path, text: str, subject: str) -> None:
+def test_wrong_files_are_named_in_one_line_and_others_say_what_they_mean(tmp_path, text, subject) -> None:
     path = tmp_path / "motion.toml"
     path.write_text(text)
     with pytest.raises(InputError) as caught:
         simulation.load_object_motion(path)
     assert caught.value.subject == f"{path} {subject}" and "\n" not in str(caught.value)
-
-
-def test_files_say_what_they_mean(tmp_path: Path) -> None:
-    path = tmp_path / "motion.toml"
     path.write_text('kind = "breathing"\namplitude_mm = 2\nperiod_s = 3.5\njitter = 0\nseed = 4\nstates = 6\n')
     expected = ObjectMotion("breathing", amplitude_mm=2.0, period_s=3.5, jitter=0.0, seed=4, states=6)
     assert simulation.load_object_motion(path) == expected
@@ -197,13 +192,6 @@ def test_objects_that_move_fast_are_sampled_finely() -> None:
     path_mm = 0.3 * 2 * np.pi / 0.4  # of the fastest second, in steps of half a voxel of 0.125 mm
     assert counts == [8, pytest.approx(path_mm / 0.0625, rel=0.03)]
     assert moving_sphere(1.0, period_s=2.0).fastest_mm_per_s == pytest.approx(0.25)
-
-
-def test_two_turns_see_every_angle_twice() -> None:
-    twice = Protocol(views=8, exposure_deg=45.0, turns=2.0)
-    np.testing.assert_allclose(np.rad2deg(twice.angle_start_rad()), np.arange(8) * 90.0)
-    assert twice.window_s() == (0.0, pytest.approx(14.0 + 1.86))
-    assert twice.at_rate(2.0).exposure_s == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize("beam", ["cone", "parallel"])
