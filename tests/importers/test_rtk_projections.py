@@ -192,6 +192,16 @@ def test_projections_of_a_maker_with_their_geometry(maker, make_files, assert_sa
     assert_same(scan, truth, grid=False, pixels=1e-3 if maker == "elekta" else 1e-4)  # whole counts
 
 
+@pytest.mark.parametrize(("maker", "below"), [("obi", "Scan0"), ("obi-16-bits", "1.2.840.5")])
+def test_a_description_above_the_folder_of_its_projections(maker, below, make_files, assert_same) -> None:
+    path, truth = make_files(maker)
+    (path / below).mkdir()
+    for file in path.glob("*.hn?"):
+        file.rename(path / below / file.name.upper())
+    assert recognise(path) == recognise(path / "ProjectionInfo.xml") == "rtk-projections"
+    assert_same(import_scan(path), truth, grid=False, pixels=1e-4)
+
+
 def test_times_of_frames_are_named_and_a_rate_and_an_exposure_make_a_fly_scan_on_a_circle(make_files, caplog) -> None:
     path, _ = make_files("elekta")
     text = (path / "_Frames.xml").read_text()
@@ -230,17 +240,20 @@ def test_pixels_without_counts_are_masked(maker, make_files, monkeypatch) -> Non
 
 @pytest.mark.parametrize(("dose", "words"), [
     ([800, 900, 1000, 1100, 1200, 1000], "divided by KVNormChamber, 0.8 to 1.2 of its median"),
-    ([7, 7, 7, 7, 7, 7], ""), ([5, 5, 0, 5, 5, 5], "KVNormChamber is not used"),
+    ([7, 7, 7, 7, 7, 7], ""), ([0, 0, 0, 0, 0, 0], ""),
+    ([800, 900, 1000, 0, 1200, 1000], "a KVNormChamber above 0, as frame 3, are not divided by it (1 of 6)"),
+    ([0, -1, 1100, 800, 1000, 1200], "a KVNormChamber above 0, as frame 0, are not divided by it (2 of 6)"),
 ])  # fmt: skip
 def test_the_dose_of_a_truebeam_s_frames(tmp_path, make_truth, caplog, dose, words) -> None:
     truth = make_truth()
-    path, times = write_probeam(tmp_path / "a", truth), np.array(dose) / np.median(dose)
+    path, usual = write_probeam(tmp_path / "a", truth), np.median([one for one in dose if one > 0] or [1])
+    times = np.where(np.array(dose) > 0, dose / usual, 1)
     for file, one in zip(sorted(path.glob("*/*/*.xim")), dose, strict=True):
         name, data = b"KVNormChamber", file.read_bytes()
         count = data.rindex(struct.pack("<I11s", 11, b"KVSourceRtn")) - 4
         more = struct.pack("<I13sIi", len(name), name, 0, one)
         file.write_bytes(data[:count] + struct.pack("<I", 6) + data[count + 4 :] + more)
-    scan, light = import_scan(path), np.log(times if "divided" in words else np.ones(6))[:, None, None]
+    scan, light = import_scan(path), np.log(times)[:, None, None]
     np.testing.assert_allclose(scan.projections - light, truth.scan.projections, atol=1e-4)
     assert words in caplog.text and (words or "KVNormChamber" not in caplog.text)
 
