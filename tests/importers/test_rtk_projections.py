@@ -197,7 +197,7 @@ def test_a_description_above_the_folder_of_its_projections(maker, below, make_fi
     path, truth = make_files(maker)
     (path / below).mkdir()
     for file in path.glob("*.hn?"):
-        file.rename(path / below / file.name.upper())
+        file.rename(path / below / file.name)
     assert recognise(path) == recognise(path / "ProjectionInfo.xml") == "rtk-projections"
     assert_same(import_scan(path), truth, grid=False, pixels=1e-4)
 

@@ -36,7 +36,7 @@ _TO_AXIS, _TO_DETECTOR, _ANGLE = NAMES[:3]
 _ANGLES = ("GantryAngle", "InPlaneAngle", "OutOfPlaneAngle")
 _RADIUS = "RadiusCylindricalDetector"
 _RAW, _ORA = (".his", ".hnd", ".hnc", ".xim"), ".ora.xml"  # endings of files that rtk_projections.py reads
-XIM_BELOW, HND_BELOW = "Acquisitions/*/*.xim", "*/*.[hH][nN][cCdD]"
+XIM_BELOW, HND_BELOW = "Acquisitions/*/*.xim", "*/*.hn[cd]"
 """Patterns of the paths of Varian's projections, relative to the folder of Scan.xml and of ProjectionInfo.xml."""
 # RTK's X, Y, Z are our y, z, x: the same right-handed frame with other names of its axes.
 _TO_WORLD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
