@@ -154,9 +154,7 @@ def test_flexray_s_tube_stage_and_panel_stand_anywhere(tmp_path, make_truth, cap
 
 
 @pytest.mark.parametrize(("binned_mm", "is_doubted"), [(2.515, False), (2.54, True), (1.25, True), (10.0, True)])
-def test_flexray_s_voxel_size_comes_before_a_binned_pixel_size_that_disagrees(
-    tmp_path, make_truth, caplog, binned_mm, is_doubted
-) -> None:
+def test_flexray_s_voxel_size_comes_before_another_pixel_size(tmp_path, make_truth, caplog, binned_mm, is_doubted) -> None:
     truth = make_truth(geometry=ConeGeometry(500.0, 800.0, (10, 14), (2.5, 2.5)))
     path = lab.write_flexray(tmp_path / "a", truth, **{"Binned pixel size": binned_mm})
     for options in (ImportOptions(), ImportOptions(source_to_axis_mm=400.0)):
