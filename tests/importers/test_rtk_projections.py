@@ -77,8 +77,8 @@ def obi_header(shape: tuple[int, int], pitch_mm: tuple[float, float], angle_deg:
 
 
 def write_obi(folder: Path, truth: Any, suffix: str, fan: str = "HalfFan", below: str = "") -> Path:
-    """ProjectionInfo.xml, and .hnd of packed differences or .hnc of 16 bits, there or in a folder below. The panel's place across is the sum of two in
-    HalfFan, and the first of them alone in FullFan."""
+    """ProjectionInfo.xml, and .hnd of packed differences or .hnc of 16 bits, there or below. The panel's place across is the
+    sum of two in HalfFan, and the first of them alone in FullFan."""
     (folder / below).mkdir(parents=True)
     g = truth.scan.geometry
     off_v, off_u = g.detector_offset_mm
