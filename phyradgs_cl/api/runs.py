@@ -52,11 +52,11 @@ _runtime_by_name = lru_cache(maxsize=4)(Runtime)  # keeps the Runtimes of four d
 
 
 @naming_arguments()
-def load_scan(path: str | Path, flats: str = "mean") -> Scan:
+def load_scan(path: str | Path, flats: str = "auto") -> Scan:
     """Reads a scan file (docs/formats.md): line integrals (F, rows, columns), lengths in mm, times in s.
 
-    path: the HDF5 file. flats: how flat fields correct a frame, by their ``mean``, by ``time`` or by ``pca``
-    (docs/prepare.md). Raises InputError, which names the HDF5 path of the wrong value."""
+    path: the HDF5 file. flats: how flat fields correct a frame, ``auto``, by their ``mean``, by ``time`` or by
+    ``pca`` (docs/prepare.md). Raises InputError, which names the HDF5 path of the wrong value."""
     return read_corrected(_checked_path(path), flats)
 
 

@@ -46,7 +46,7 @@ class CountReader:
             frames = data[image_key == 0]
             self.ceiling = float(data[(image_key == 0) | (image_key == 1)].max())
             self.at_ceiling = clustered_share(frames == self.ceiling)
-        return counts_to_attenuation(data, image_key, quantity)
+        return counts_to_attenuation(data, image_key, quantity, at)
 
 
 def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:

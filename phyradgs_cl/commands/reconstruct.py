@@ -14,7 +14,7 @@ from phyradgs_cl.commands import options
 from phyradgs_cl.commands.console import complain, file_option, last_words, option, say, scores
 from phyradgs_cl.commands.options import CheckpointEvery, ObjectMotion, Output, Scan, with_run_options
 from phyradgs_cl.estimate import duration, estimate, seconds_around
-from phyradgs_cl.io import partial_path, refuse_overwriting
+from phyradgs_cl.io import only_run, partial_path, refuse_overwriting
 from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import Progress, ProgressReport, Reconstruction
@@ -94,6 +94,7 @@ def reconstruct_command(
             if ranks.rank == 0:
                 shown = {"scan": str(scan), "method": plan.method_name, "seed": plan.seed}
                 shown |= {"input": plan.preprocessing.facts(), "options": option_facts(plan.options)}
+                stack.enter_context(only_run(live))
                 page = stack.enter_context(report.LivePage(live, output.name, shown))
                 listeners.append(page)
         stage(f"reading {scan}")
@@ -101,6 +102,8 @@ def reconstruct_command(
         if preview is not None:
             check_picture("--preview", preview, *files)
             refuse_overwriting("--preview", partial_path(preview), *files)
+            if ranks.rank == 0:
+                stack.enter_context(only_run(preview))
             picture = report.Preview(preview)
             listeners.append(picture)
         result, metrics = run_reconstruction(

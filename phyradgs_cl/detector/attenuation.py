@@ -36,15 +36,23 @@ def counts_to_attenuation(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Converts the projections of a scan, data (F, v, u), to line integrals (P, v, u) float32, always finite.
 
-    quantity: "counts": the transmission is (I − dark) / (flat − dark), with the mean flat and the mean dark (0 without
-    darks). "transmission": data are the transmission. "attenuation": data are line integrals already. image_key (F,): 0
-    projection, 1 flat, 2 dark, 3 invalid. at: not used, as the flats' mean has no time; see ``io.scan.reader``.
+    quantity: "counts": the transmission is (I − dark) / (flat − dark), with the mean dark (0 without darks). "transmission":
+    data are the transmission. "attenuation": data are line integrals already. image_key (F,): 0 projection, 1 flat, 2 dark,
+    3 invalid. at (F,): when frames were taken, in any unit. Flats without a projection between them are averaged, and these
+    means interpolated linearly in ``at``; None takes the mean of all flats.
 
     The second result (P, v, u) is True where a value must not be used: it is not finite, the flat is not brighter than the
     dark, or the transmission is at most ``TRANSMISSION_FLOOR``. Raises InputError for counts without a flat."""
     frames, key = np.asarray(data), np.asarray(image_key)
     numbers = np.flatnonzero(key == PROJECTION)
-    return frames_to_attenuation(frames, quantity, frames[key == FLAT], frames[key == DARK], numbers=numbers)
+    flats, darks = frames[key == FLAT], frames[key == DARK]
+    if at is None or quantity != "counts" or len(flats) == 0:
+        return frames_to_attenuation(frames, quantity, flats, darks, numbers=numbers)
+    when, flats_at = np.asarray(at)[numbers], np.asarray(at)[key == FLAT]
+    times = flats_by_time(flats_at, when)
+    means = np.stack([flats[group].mean(axis=0, dtype=np.float64) for group in times])
+    place = np.interp(when, [flats_at[group].mean() for group in times], np.arange(len(times)))
+    return frames_to_attenuation(frames, quantity, means, darks, place=place, numbers=numbers)
 
 
 def frames_to_attenuation(

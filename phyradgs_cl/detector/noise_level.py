@@ -134,11 +134,12 @@ def transmission_weights(
 def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> Saturation:
     """Returns the largest count of projections (P, v, u), and the fraction of their pixels that are clipped at it.
 
-    Only whole areas count as clipped. An area as bright as the mean ``flat`` (v, u) may be air without noise: it counts only
-    if the other pixels of the frames are noisy."""
+    Only whole areas count as clipped. An area as bright as the mean ``flat`` (v, u), or at a level that is no whole number,
+    may be air without noise: it counts only if the other pixels of the frames are noisy."""
     level = float(np.fmax.reduce([np.fmax.reduce(frame, axis=None) for frame in frames]))
     share = clustered_share(frame == level for frame in frames)
-    if share <= LEAST_SHARE or not (_flat_differs(frames, flat, level) or _shows_noise(frames, level)):
+    is_other = level.is_integer() and _flat_differs(frames, flat, level)
+    if share <= LEAST_SHARE or not (is_other or _shows_noise(frames, level)):
         share = 0.0
     return Saturation(level, share)
 

@@ -48,7 +48,7 @@ class PrepareOptions:
     of ``STEPS``, separated by commas. Each other field has the options of the step of its name. Raises InputError for
     unknown steps, and for options of steps that are not named."""
 
-    flats: str = checks.option("mean", words=WAYS)
+    flats: str = checks.option("auto", words=WAYS)
     steps: str = checks.option("", STEPS_HELP, "none", metavar="NAME,...")
     sparks: SparkOptions = SparkOptions()
     dead: DeadOptions = DeadOptions()
@@ -81,7 +81,7 @@ class PrepareOptions:
 
     def step_facts(self) -> dict[str, object]:
         """Returns what the provenance records: ``flats`` and ``steps`` if not the default, and each step's options."""
-        flats = {} if self.flats == "mean" else {"flats": self.flats}
+        flats = {} if self.flats == "auto" else {"flats": self.flats}
         steps = {"steps": ",".join(self.chosen)} if self.chosen else {}
         return {**flats, **steps, **{name: asdict(getattr(self, name)) for name in self.chosen}}
 
@@ -100,7 +100,7 @@ def one_by_one(
     scan: Scan, options: PrepareOptions, make_model: MakeModel
 ) -> Iterator[tuple[str, Scan, Facts]]:
     """Applies the chosen steps as ``prepare`` does. Yields for each step its name, the scan after it, and its numbers."""
-    if options.flats not in ("mean", scan.provenance.get("flats")):
+    if options.flats not in ("auto", scan.provenance.get("flats")):
         expected = "counts and their flats, read from a file: load_scan(path, flats=...)"
         raise InputError("option flats", "a scan of line integrals", expected, "leave it out")
     for name in options.chosen:

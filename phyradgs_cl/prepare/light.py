@@ -1,5 +1,6 @@
 """Corrects light that changes during a scan: its pattern by flats, its amount by the air in each frame.
 
+- auto: as time, or the mean where the flats come at one time.
 - mean: all flats are averaged.
 - time: flats without a projection between them are averaged, and these means interpolated linearly in time. Without times
   the stored frames' numbers stand for them.
@@ -24,8 +25,6 @@ from phyradgs_cl.detector.attenuation import (
     FLAT,
     PROJECTION,
     TRANSMISSION_FLOOR,
-    flats_by_time,
-    frames_to_attenuation,
     mean_dark,
     minus_log,
 )  # fmt: skip
@@ -34,7 +33,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import ToAttenuation, read_scan
 from phyradgs_cl.prepare.step import Facts, MakeModel, StepOptions, unmasked_frames
 
-WAYS = ("mean", "time", "pca")
+WAYS = ("auto", "mean", "time", "pca")
 _MOST_COMPONENTS, _CLEAR = 4, 4.0  # most components used; a component with less than 4 times the median variance is noise
 _REWEIGHTINGS = 12  # rounds of least squares, each with new weights
 _LEAST_PIXELS = 20  # with fewer pixels of air in a frame, their median is too noisy
@@ -63,31 +62,28 @@ def flat_correction(way: str) -> ToAttenuation:
     default their numbers. It returns line integrals (P, v, u) and bad pixels. It raises InputError for too few flats and,
     with "time" or "pca", for other quantities than "counts"."""
     checks.one_of("flats", way, WAYS)
-    return counts_to_attenuation if way == "mean" else partial(_with_changing_flats, way)
+    return counts_to_attenuation if way == "auto" else partial(_with_flats, way)
 
 
-def read_corrected(path: str | Path, flats: str = "mean", rows: tuple[int, int] | None = None) -> Scan:
+def read_corrected(path: str | Path, flats: str = "auto", rows: tuple[int, int] | None = None) -> Scan:
     """Reads a scan file, or its rows [first, stop), as line integrals (``flat_correction``). Raises as ``io.read_scan``."""
     scan = read_scan(path, flat_correction(flats), rows)
-    return scan if flats == "mean" else replace(scan, provenance={**scan.provenance, "flats": flats})
+    return scan if flats == "auto" else replace(scan, provenance={**scan.provenance, "flats": flats})
 
 
-def _with_changing_flats(
+def _with_flats(
     way: str, data: Counts, image_key: np.ndarray, quantity: str, at: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
+    if way == "mean":
+        return counts_to_attenuation(data, image_key, quantity)
     flats = np.flatnonzero(image_key == FLAT)
     needed = 2 if way == "time" else 3
     if quantity != "counts" or len(flats) < needed:
         found, remedy = f"{quantity} with {len(flats)} flats", "take the mean of the flats (flats=mean)"
         raise InputError(f"flats={way}", found, f"counts with at least {needed} flats", remedy)
-    numbers, darks = np.flatnonzero(image_key == PROJECTION), data[image_key == DARK]
     if way == "time":
-        at = np.arange(len(data)) if at is None else at
-        times = [flats[group] for group in flats_by_time(at[flats], at[numbers])]
-        means = np.stack([data[group].mean(axis=0, dtype=np.float64) for group in times])
-        place = np.interp(at[numbers], [at[group].mean() for group in times], np.arange(len(times)))
-        return frames_to_attenuation(data, quantity, means, darks, place=place, numbers=numbers)
-    dark = mean_dark(darks, data.shape[1:])
+        return counts_to_attenuation(data, image_key, quantity, np.arange(len(data)) if at is None else at)
+    numbers, dark = np.flatnonzero(image_key == PROJECTION), mean_dark(data[image_key == DARK], data.shape[1:])
     signal = np.maximum(data[flats].astype(np.float64) - dark, 0)
     lights = _of_components(signal, (data[frame] - dark for frame in numbers))
     result = np.empty((len(numbers), *data.shape[1:]), np.float32)

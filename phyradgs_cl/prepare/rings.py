@@ -205,6 +205,8 @@ def find_single_gains(
         return offset, ""
     paired = np.s_[:, mirrored[::-1]]
     usable = usable[paired] & usable[:, mirrored]
+    if not full_turn:  # the median over neighbours is one-sided at the ends, where the mean of an arc may slope
+        usable[:, [0, -1]] = False
     means = means[..., mirrored[::-1]]
     medians = [np.median(_deviation(m), axis=1, keepdims=True) for m in (means, means - means[..., ::-1])]
     lines = _outliers(medians[0], medians[1], usable.mean(axis=0, keepdims=True) > 0.5)

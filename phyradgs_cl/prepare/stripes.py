@@ -26,6 +26,7 @@ _LEAST = 2e-3  # a stripe whose line integrals deviate by less is left alone: it
 _NEAR = 5  # each side of a column is represented by the median of this many columns
 _FLUCTUATING = 3.0  # a column fluctuates if it changes this many times as much between views as the columns at both sides
 _UNRESPONSIVE = 10.0  # a column does not respond if it varies this many times less than the columns at both sides
+_END = 5.0  # the panel's last column may be bad if it differs from its neighbour this many times as much as the next do
 _MIRRORED = 2.0  # an edge shows in the mirror image too: a stripe deviates this many times as much as its image
 _SMALLEST = 1e-6  # least spread of a column, in line integrals, as a divisor: the spread of a stuck pixel is 0
 
@@ -56,15 +57,28 @@ def remove_stripes(
         fluctuation = np.median(np.abs(np.diff(sinogram, 2, axis=0)), axis=0) / np.sqrt(6)
         low, high = np.percentile(sinogram, (25, 75), axis=0)
         interpolated[row] = _stand_out(fluctuation, _FLUCTUATING, mirrored)
-        interpolated[row] |= _stand_out(1 / np.maximum(high - low, _SMALLEST), _UNRESPONSIVE, mirrored)
+        unresponsive = _stand_out(1 / np.maximum(high - low, _SMALLEST), _UNRESPONSIVE, mirrored)
+        interpolated[row, 1:-1] |= unresponsive[1:-1]  # in the last column, an object may end
         fill_lines(sinogram.T, interpolated[row])
         order = np.argsort(sinogram, axis=0, kind="stable")
         ranked = np.take_along_axis(sinogram, order, axis=0)
-        smooth = scipy.ndimage.median_filter(ranked, (1, width))
+        smooth = _across(ranked, width)
         replaced[row] = _stand_out(np.abs(ranked - smooth).mean(axis=0), ratio, mirrored)
         columns = np.flatnonzero(replaced[row])
         sinogram[order[:, columns], columns] = smooth[:, columns]
     return clean, interpolated, replaced
+
+
+def _across(ranked: np.ndarray, width: int) -> np.ndarray:
+    """Returns the median across ``width`` sorted columns (view, column). Beyond an end the last column counts again, so that
+    a slope, as of an object that the panel cuts off, stays. That column is its neighbour instead if it differs far more from
+    it, in most views, than the next columns do from theirs."""
+    smooth = scipy.ndimage.median_filter(ranked, (1, width), mode="nearest")
+    for side in (1, -1):
+        steps = np.abs(np.diff(ranked[:, ::side][:, :4]))
+        if np.median(steps[:, 0]) > _END * steps[:, 1:].mean(axis=0).max():
+            smooth[:, ::side][:, 0] = ranked[:, ::side][:, 1]
+    return smooth
 
 
 def _stand_out(values: np.ndarray, ratio: float, mirrored: np.ndarray) -> np.ndarray:

@@ -27,7 +27,7 @@ _KINDS = {
 _OF_MOTION = ("fields", "control_points", "displacements_below_mm", "smallest_determinant")  # shown of a deformation
 
 
-def load_scan(path: str | Path, flats: str = "mean", rows: tuple[int, int] | None = None) -> Scan:
+def load_scan(path: str | Path, flats: str = "auto", rows: tuple[int, int] | None = None) -> Scan:
     """Reads a scan file as line integrals, see ``read_corrected``. rows: detector rows [first, stop); None reads all. Raises
     InputError for a file that is no scan or is damaged."""
     with expecting(path, "scan"):

@@ -66,7 +66,7 @@ def run_preparation(
     """Applies the steps of ``options`` to the scan ``source``, and writes line integrals with bad pixels masked and
     interpolated. Returns what each step did, in order, which is in the file's provenance too, and the names of steps that
     had been applied before. Raises InputError and OutputError."""
-    if not options.chosen and options.flats == "mean":
+    if not options.chosen and options.flats == "auto":
         raise InputError("--steps", "none", f"some of {', '.join(STEPS)}", "leave it out for the usual ones")
     options.check_written()
     check_output(output, source, config)

@@ -9,7 +9,7 @@ from skimage.io import imread
 from phyradgs_cl import progress
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import partial_path, read_volume
+from phyradgs_cl.io import only_run, partial_path, read_volume
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.report import Preview
@@ -64,6 +64,15 @@ def test_pages_and_pictures_do_not_replace_what_matters(refused, scan, tmp_path,
         refused(["reconstruct", scan, "-o", output, flag, path], flag)
     refused(["reconstruct", scan, "-o", output, flag, tmp_path / "none" / f"now.{suffix}"], "none", status=4)
     assert scan.read_bytes() == before and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("flag", "name"), [("--live", "run.html"), ("--preview", "now.png")])
+def test_two_runs_do_not_share_a_page_or_a_picture(cli, refused, scan, tmp_path, flag, name) -> None:
+    path, output = tmp_path / name, tmp_path / "v.h5"
+    command = ["reconstruct", str(scan), "-o", str(output), "--method", "fdk", flag, str(path)]
+    with only_run(path):
+        refused(command, f"{path}: found another run at work on it", status=4)
+    assert not list(tmp_path.iterdir()) and cli.run(command) == 0 and path.exists()
 
 
 GRID = Grid.cube(4, 2.0)

@@ -84,11 +84,14 @@ def test_a_panel_that_clips_is_found() -> None:
         frames = np.minimum(counts(noisy=True) + 400, level).astype(dtype)
         found = find_saturation(frames, np.full(SHAPE[1:], min(AIR + 400, level) if flat_too else AIR + 400))
         assert found.level == level and found.share == np.mean(frames == level) > 0.3
+    scaled = np.minimum(counts(noisy=True), 40_000) / 7  # by a dose, or a mean of frames
+    assert find_saturation(scaled, np.full(SHAPE[1:], AIR / 7)).share > 0.3
 
 
 GOOD = {
     "noise": (counts(noisy=True), AIR), "no noise": (counts(noisy=False), AIR),
     "no noise at the end of 16 bits": (np.round(counts(noisy=False) * 65535 / AIR), 65535.0),
+    "no noise, under a beam that falls": (counts(noisy=False) * np.array([0.971, 0.9, 0.8, 0.7])[:, None, None] + 0.3, AIR),
     "noise and a hot pixel": (np.where(np.arange(64) == 9, 65535, counts(noisy=True)) * (np.arange(48) == 9)[:, None], AIR),
     "NaN": (np.where(counts(True) > 50_500, np.nan, counts(True)), AIR),
 }

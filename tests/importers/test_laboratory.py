@@ -153,6 +153,18 @@ def test_flexray_s_tube_stage_and_panel_stand_anywhere(tmp_path, make_truth, cap
     assert "no tra_obj (0), no Start angle (0), no ROI (LTRB) (the whole panel)" in caplog.text
 
 
+@pytest.mark.parametrize(("binned_mm", "is_doubted"), [(2.515, False), (2.54, True), (1.25, True), (10.0, True)])
+def test_flexray_s_voxel_size_comes_before_another_pixel_size(tmp_path, make_truth, caplog, binned_mm, is_doubted) -> None:
+    truth = make_truth(geometry=ConeGeometry(500.0, 800.0, (10, 14), (2.5, 2.5)))
+    path = lab.write_flexray(tmp_path / "a", truth, **{"Binned pixel size": binned_mm})
+    for options in (ImportOptions(), ImportOptions(source_to_axis_mm=400.0)):
+        size_mm = import_scan(path, options).geometry.pixel_size_mm
+        assert size_mm == pytest.approx([2.5 if is_doubted else binned_mm] * 2)
+    said = f"Binned pixel size {binned_mm:g} mm is not used, as Voxel size makes it 2.5 mm; say pixel_size_mm"
+    assert caplog.text.count(said) == 2 * is_doubted
+    assert import_scan(path, ImportOptions(pixel_size_mm=1.5)).geometry.pixel_size_mm == (1.5, 1.5)
+
+
 def test_zeiss_s_shifts_move_the_panel(tmp_path, make_truth, caplog) -> None:
     """An image that is to be moved to the right by a column was taken by a panel a column further to the left."""
     geometry = ConeGeometry(512.0, 1024.0, (10, 14), (2.5, 2.5))

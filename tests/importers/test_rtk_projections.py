@@ -76,10 +76,10 @@ def obi_header(shape: tuple[int, int], pitch_mm: tuple[float, float], angle_deg:
     return text + numbers.astype("<f8").tobytes()
 
 
-def write_obi(folder: Path, truth: Any, suffix: str, fan: str = "HalfFan") -> Path:
-    """ProjectionInfo.xml, and .hnd of packed differences or .hnc of 16 bits. The panel's place across is the sum of two in
-    HalfFan, and the first of them alone in FullFan."""
-    folder.mkdir()
+def write_obi(folder: Path, truth: Any, suffix: str, fan: str = "HalfFan", below: str = "") -> Path:
+    """ProjectionInfo.xml, and .hnd of packed differences or .hnc of 16 bits, there or below. The panel's place across is the
+    sum of two in HalfFan, and the first of them alone in FullFan."""
+    (folder / below).mkdir(parents=True)
     g = truth.scan.geometry
     off_v, off_u = g.detector_offset_mm
     lateral_mm = 40.0
@@ -96,7 +96,7 @@ def write_obi(folder: Path, truth: Any, suffix: str, fan: str = "HalfFan") -> Pa
             body = header.ljust(512, b"\0") + image.astype("<u2").tobytes()
         else:
             body = header.ljust(1024, b"\0") + b"".join(differences(image))
-        (folder / f"Proj_{i:05d}.{suffix}").write_bytes(body)
+        (folder / below / f"Proj_{i:05d}.{suffix}").write_bytes(body)
     return folder
 
 
@@ -163,10 +163,13 @@ GEOMETRIES = {
     "elekta": ConeGeometry(1000.0, 1536.0, (72, 92), (409.6 / 80, 409.6 / 100), (-3.0, 2.0)),
     "obi": ConeGeometry(500.0, 800.0, (10, 16), (3.0, 2.5), (4.0, -6.0)),
 }
+GEOMETRIES["obi-below"] = GEOMETRIES["obi"]
 MAKERS: dict[str, tuple[Callable[[Path, Any], Path], str]] = {
     "elekta": (write_elekta, "_Frames.xml"),
     "obi": (partial(write_obi, suffix="hnd"), "ProjectionInfo.xml"),
     "obi-16-bits": (partial(write_obi, suffix="hnc", fan="FullFan"), "ProjectionInfo.xml"),
+    "obi-below": (partial(write_obi, suffix="hnd", below="Scan0"), "ProjectionInfo.xml"),
+    "obi-16-bits-below": (partial(write_obi, suffix="hnc", below="1.2.840"), "ProjectionInfo.xml"),
     "probeam": (write_probeam, "Scan.xml"),
     "ora": (write_ora, "00000.ora.xml"),
 }
@@ -230,17 +233,20 @@ def test_pixels_without_counts_are_masked(maker, make_files, monkeypatch) -> Non
 
 @pytest.mark.parametrize(("dose", "words"), [
     ([800, 900, 1000, 1100, 1200, 1000], "divided by KVNormChamber, 0.8 to 1.2 of its median"),
-    ([7, 7, 7, 7, 7, 7], ""), ([5, 5, 0, 5, 5, 5], "KVNormChamber is not used"),
+    ([7, 7, 7, 7, 7, 7], ""), ([0, 0, 0, 0, 0, 0], ""),
+    ([800, 900, 1000, 0, 1200, 1000], "a KVNormChamber above 0, as frame 3, are not divided by it (1 of 6)"),
+    ([0, -1, 1100, 800, 1000, 1200], "a KVNormChamber above 0, as frame 0, are not divided by it (2 of 6)"),
 ])  # fmt: skip
 def test_the_dose_of_a_truebeam_s_frames(tmp_path, make_truth, caplog, dose, words) -> None:
     truth = make_truth()
-    path, times = write_probeam(tmp_path / "a", truth), np.array(dose) / np.median(dose)
+    path, usual = write_probeam(tmp_path / "a", truth), np.median([one for one in dose if one > 0] or [1])
+    times = np.where(np.array(dose) > 0, dose / usual, 1)
     for file, one in zip(sorted(path.glob("*/*/*.xim")), dose, strict=True):
         name, data = b"KVNormChamber", file.read_bytes()
         count = data.rindex(struct.pack("<I11s", 11, b"KVSourceRtn")) - 4
         more = struct.pack("<I13sIi", len(name), name, 0, one)
         file.write_bytes(data[:count] + struct.pack("<I", 6) + data[count + 4 :] + more)
-    scan, light = import_scan(path), np.log(times if "divided" in words else np.ones(6))[:, None, None]
+    scan, light = import_scan(path), np.log(times)[:, None, None]
     np.testing.assert_allclose(scan.projections - light, truth.scan.projections, atol=1e-4)
     assert words in caplog.text and (words or "KVNormChamber" not in caplog.text)
 

@@ -9,8 +9,9 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import compare, prepare, reconstruct
 from phyradgs_cl.detector.effects import add_scatter, beer_lambert_noise
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.prepare import DEFAULT_STEPS, PREPARED_KEY, find_dead
+from phyradgs_cl.prepare import DEFAULT_STEPS, PREPARED_KEY, find_dead, remove_stripes
 from phyradgs_cl.prepare.light import enough_air
+from phyradgs_cl.prepare.rings import find_single_gains, mirror_columns
 
 CONE, PARALLEL = (5.0, 7.0), (500.0, 501.0)  # source to axis and to panel in mm
 SLOW = pytest.mark.slow
@@ -85,6 +86,31 @@ def test_columns_on_the_axis_that_are_stuck_or_flicker_are_dead(values) -> None:
     frames = discs(BODY, 20.0, 0.005)
     frames[:, :, 20] = values[0] + values[1] * np.random.default_rng(4).standard_normal((60, 9))
     assert np.flatnonzero(find_dead(frames, axis_column=20.0).all(axis=0)).tolist() == [20]
+
+
+# An off-centre panel's inner end, one inside the object, and ends that the object just reaches; as a turn and as arcs.
+CUT_OFF = [(15.0, 1.0, 4.0), (18.0, 4.0, 37.0), (26.0, 9.0, 20.0), (5.0, 16.0, 20.5), (9.0, 12.6, 18.3), (12.0, 9.0, 20.0)]
+
+
+@pytest.mark.parametrize(("radius", "distance", "axis"), CUT_OFF)
+@pytest.mark.parametrize("noise", [0.0, 0.002])
+def test_the_panels_ends_keep_an_object_that_they_cut_off(radius, distance, axis, noise) -> None:
+    frames = discs([(0.04, radius, distance)], axis, noise).astype(np.float32)
+    for width in (3, 5, 9):
+        np.testing.assert_array_equal(remove_stripes(frames, width=width, axis_column=axis)[0], frames)
+    for first in range(0, 60, 6):
+        means = np.roll(frames, -first, 0)[:18].reshape(2, 9, 9, 41).mean(axis=1)
+        assert not find_single_gains(means, mirror_columns(41, axis), np.ones((9, 41), bool), False)[1]
+
+
+@pytest.mark.parametrize("column", [0, 40])
+@pytest.mark.parametrize("fault", [(1, 0.08, 0), (1, -0.03, 0), (1, 0, 0.3), (0, 0.6, 0)])
+def test_stripes_at_the_panels_ends_are_found(column, fault) -> None:
+    """(share of what was there, offset, deviation in time): a gain, one that flickers, a stuck column."""
+    clean, (share, offset, deviation) = discs(BODY, 20.0, 0.002).astype(np.float32), fault
+    frames, flicker = clean.copy(), np.random.default_rng(1).standard_normal((60, 9))
+    frames[:, :, column] = share * clean[:, :, column] + offset + deviation * flicker
+    assert rms(remove_stripes(frames, axis_column=20.0)[0] - clean) < 0.1 * rms(frames - clean)
 
 
 @SLOW

@@ -8,9 +8,11 @@ import pytest
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import load_scan
+from phyradgs_cl.check.detector import CountReader
+from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan
-from phyradgs_cl.io import write_scan
+from phyradgs_cl.io import read_scan, write_scan
 from phyradgs_cl.prepare import flat_correction
 from phyradgs_cl.reconstructors import Preprocessing
 from phyradgs_cl.reconstructors.preprocess import prepared
@@ -50,7 +52,7 @@ def test_files_are_read_with_them_and_scans_of_line_integrals_refused(planted, t
     clean = planted(noise="none", dose=None)
     data, key = counts(clean, 1)
     write_scan(tmp_path / "counts.h5", clean, data=data, image_key=key, quantity="counts")
-    found, mean = load_scan(tmp_path / "counts.h5", flats="time"), load_scan(tmp_path / "counts.h5")
+    found, mean = load_scan(tmp_path / "counts.h5", flats="time"), load_scan(tmp_path / "counts.h5", flats="mean")
     assert np.abs(found.projections - mean.projections).max() > 0.01
     assert prepared(found, Preprocessing(flats="time")) is found
     for call in (
@@ -88,7 +90,9 @@ def test_flats_are_taken_at_the_times_that_the_file_states(tmp_path, place, ligh
     found = [import_scan(file, ImportOptions(flats=way)) for way in (None, "time")]
     assert all("of 3 times, interpolated" in scan.provenance["taken"] for scan in found)
     if place == "frame_start_time":  # the only one in scan files
-        found.append(load_scan(file, flats="time"))
+        found += [load_scan(file, flats="time"), load_scan(file)]
+        found += [read_scan(file, reader) for reader in (CountReader(), counts_to_attenuation)]
+        assert np.abs(load_scan(file, flats="mean").projections).max() > 0.05
     for scan in found:
         np.testing.assert_allclose(scan.projections, 0, atol=1e-4)
 

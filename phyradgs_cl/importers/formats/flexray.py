@@ -26,6 +26,7 @@ _NAMES = (
     *("Exposure time (ms)", "Number of averages"),
 )
 _WHOLE_MIDDLE = (971, 767)  # (column, row) of the panel's middle without binning, as in flexdata
+_DISAGREE = 0.01  # a binned pixel size that is off by more than this fraction of the voxel size's pixel is not used
 _WHOLE_PITCH_MM = 0.0748  # pixel pitch of the panel without binning
 
 
@@ -50,7 +51,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         _log.warning(text, path, len(flats), options.named("flats"))
     names = {
         "source_to_axis_mm": scan.name("SOD"), "source_to_detector_mm": scan.name("SDD"),
-        "pixel_size_mm": scan.name("Binned pixel size" if scan.has("Binned pixel size") else "Voxel size"),
+        "pixel_size_mm": scan.name("Voxel size" if scan.has("Voxel size") else "Binned pixel size"),
         "angles": scan.name("Last angle"), "exposure_s": scan.name("Exposure time (ms)"),
     }  # fmt: skip
     stage = _stage(scan, panel, options, names)
@@ -73,8 +74,17 @@ def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names
     to_detector_mm = options.taken("source_to_detector_mm", partial(scan.length, "SDD"))
 
     def pitch_mm() -> tuple[float, float]:
-        at_sample_mm = None if scan.has("Binned pixel size") else scan.measured("Voxel size", LENGTH, "um")
-        size_mm = at_sample_mm * to_detector_mm / to_axis_mm if at_sample_mm else scan.length("Binned pixel size")
+        binned_mm = scan.length("Binned pixel size") if scan.has("Binned pixel size") else None
+        if binned_mm is not None and not scan.has("Voxel size"):
+            return binned_mm, binned_mm
+        is_stated = scan.has("SOD") and scan.has("SDD")  # the voxel size belongs to these distances, whatever options say
+        ratio = scan.length("SDD") / scan.length("SOD") if is_stated else to_detector_mm / to_axis_mm
+        size_mm = scan.measured("Voxel size", LENGTH, "um") * ratio
+        if binned_mm is not None and abs(binned_mm - size_mm) <= _DISAGREE * size_mm:
+            return binned_mm, binned_mm
+        if binned_mm is not None:  # which, as flexdata says, cannot be trusted in all logs
+            text = "%s Binned pixel size %.6g mm is not used, as Voxel size makes it %.6g mm; say %s to overrule both"
+            _log.warning(text, scan.subject, binned_mm, size_mm, options.named("pixel_size_mm"))
         return size_mm, size_mm
 
     place_mm = {name: scan.position(name) for name in _PLACES}

@@ -36,8 +36,8 @@ _TO_AXIS, _TO_DETECTOR, _ANGLE = NAMES[:3]
 _ANGLES = ("GantryAngle", "InPlaneAngle", "OutOfPlaneAngle")
 _RADIUS = "RadiusCylindricalDetector"
 _RAW, _ORA = (".his", ".hnd", ".hnc", ".xim"), ".ora.xml"  # endings of files that rtk_projections.py reads
-XIM_BELOW = "Acquisitions/*/*.xim"
-"""Pattern of the paths of Varian TrueBeam's projections, relative to the folder of Scan.xml."""
+XIM_BELOW, HND_BELOW = "Acquisitions/*/*.xim", "*/*.hn[cd]"
+"""Patterns of the paths of Varian's projections, relative to the folder of Scan.xml and of ProjectionInfo.xml."""
 # RTK's X, Y, Z are our y, z, x: the same right-handed frame with other names of its axes.
 _TO_WORLD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
@@ -62,7 +62,7 @@ def recognises(path: Path) -> bool:
         return False
     if path.is_dir() or is_stack:
         return bool(folder.matching(*STACKS))
-    return not folder.matching(*_RAW) and not any(folder.root.glob(XIM_BELOW))
+    return not folder.matching(*_RAW) and not any(any(folder.root.glob(p)) for p in (XIM_BELOW, HND_BELOW))
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:

@@ -18,7 +18,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.files import SafeFolder, check_room, in_natural_order, naming_damage
-from phyradgs_cl.importers.formats.rtk import XIM_BELOW, read_rtk_xml, scan_of, stack_of
+from phyradgs_cl.importers.formats.rtk import HND_BELOW, XIM_BELOW, read_rtk_xml, scan_of, stack_of
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 
 _log = logging.getLogger(__name__)
@@ -42,7 +42,7 @@ class _Maker:
 
 _MAKERS = (
     _Maker("_frames.xml", (".his",), "ElektaXVI5GeometryXMLFileReader"),
-    _Maker("projectioninfo.xml", (".hnd", ".hnc"), "VarianObiGeometryReader"),
+    _Maker("projectioninfo.xml", (".hnd", ".hnc"), "VarianObiGeometryReader", HND_BELOW),
     _Maker("scan.xml", (".xim",), "VarianProBeamGeometryReader", XIM_BELOW),
     _Maker(".ora.xml", (".ora.xml",), "OraGeometryReader", options=(*TIMING, "detector_model")),
 )
@@ -126,11 +126,14 @@ def _air(path: Path, projections: list[Path], options: ImportOptions) -> np.ndar
             text = "%s: air is taken for %.0f counts, as RTK does; say %s if a frame without an object has others"
             _log.warning(text, path, usual, options.named("flat_value"))
     dose = np.array([*map(_dose, projections)]) if suffix == ".xim" else np.zeros(len(projections))
-    if dose.min() <= 0:
-        if dose.any():
-            _log.warning("%s: %s is not used: some frames have none above 0", path, _CHAMBER.decode())
+    has_dose = dose > 0
+    if not has_dose.any():
         return np.full(len(projections), usual)
-    times = dose / np.median(dose)
+    times = np.where(has_dose, dose / np.median(dose[has_dose]), 1.0)
+    if not has_dose.all():
+        text = "%s: frames without a %s above 0, as frame %d, are not divided by it (%d of %d)"
+        which = int(np.argmin(has_dose)), int(np.count_nonzero(~has_dose)), len(dose)
+        _log.warning(text, path, _CHAMBER.decode(), *which)
     if np.ptp(times) > 0:
         text = "%s: frames are divided by %s, %.4g to %.4g of its median"
         _log.warning(text, path, _CHAMBER.decode(), times.min(), times.max())
