@@ -35,8 +35,8 @@ _MATTER, _NOISES = 0.1, 4.0  # matter is above this fraction of the largest valu
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 _AT_END = 0.1  # an object reaches beyond the first or last row if more than this fraction of its pixels shows matter
 # Standard deviation, in blocks, of the Gaussian that smooths frames of nearly parallel rays: of a grid narrower than this
-# fraction of its distance from the source. A row's rays stay in one slice in all views, so that errors of voxels and of edges
-# narrower than a pixel do not average out: with 0.8 a roll of 0.8° came out at 0.73°, unsmoothed at 0.6°.
+# fraction of its distance from the source. A row's rays stay in one slice in all views, so that errors of voxels, and of
+# edges narrower than a pixel, do not average out: with 0.8 a roll of 0.8° came out at 0.73°, unsmoothed at 0.6°.
 _SMOOTHING_NARROW, _NARROW = 1.6, 0.3
 Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
@@ -275,7 +275,7 @@ def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:
     other are not smoothed together: they see the object at different angles, and smoothed they would look like a shorter
     readout. A readout by columns shears the image, and smoothing does not change the shear.
 
-    Frames of nearly parallel rays are smoothed more, single pixels too: they stay the frames of an object, a smoother one."""
+    Frames of nearly parallel rays are smoothed more, single pixels too: they stay frames of an object, a smoother one."""
     cone, width_mm = scan.geometry, max(scan.grid.size_mm[1:])
     is_narrow = not isinstance(cone, ConeGeometry) or width_mm < _NARROW * cone.source_to_axis_mm
     if block == 1 and not is_narrow:

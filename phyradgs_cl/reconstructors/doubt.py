@@ -130,8 +130,8 @@ def finer(volume: Array) -> NDArray[np.float32]:
 def view_numbers(scan: Scan) -> Array:
     """Returns the number (F,) of each frame's view, from 0 in the order of angles; frames of one angle are one view.
 
-    Each frame is a view of its own, in the order of time, if there are fewer than 4 angles, or if the orbit travels along the
-    axis, since each turn then sees another height."""
+    Each frame is a view of its own, in the order of time, if there are fewer than 4 angles, or if the orbit travels along
+    the axis, since each turn then sees another height."""
     pose = middle_poses(scan)
     view, angles_rad = distinct_views(azimuth_rad(pose))
     if len(angles_rad) < FEWEST_FRAMES or travels(pose, scan.projections.shape[1], scan.is_parallel):

@@ -69,7 +69,7 @@ def test_an_offset_and_a_roll_are_found_in_half_a_turn_and_a_right_scan_is_left_
 
 
 @pytest.mark.parametrize(
-    ("so_mm", "turn_deg", "off_mm", "roll_deg"), [(0, 360, 0.15, -0.9), (0, 180, -0.1, 1.2), (100, 360, 0.12, -0.9)]
+    ("so_mm", "turn_deg", "off_mm", "roll_deg"), [(0, 360, 0.15, -0.9), (0, 180, -0.1, 1.2), (60, 360, 0.15, -0.9)]
 )
 def test_the_roll_of_sharp_edges_is_whole_in_rays_that_stay_in_a_slice(rt, so_mm, turn_deg, off_mm, roll_deg) -> None:
     """Single pixels, whose errors at edges took a tenth to a quarter of the roll; in half a turn all of it."""
@@ -85,7 +85,7 @@ def test_the_roll_of_sharp_edges_is_whole_in_rays_that_stay_in_a_slice(rt, so_mm
     offset, roll = calibrate(replace(scan, projections=noisy.astype(np.float32)), rt, "offset-u,roll").parameters
     assert offset.verdict == roll.verdict == CORRECTED
     assert abs(offset.found - off_mm) < min(2 * offset.deviation, 0.002)
-    assert abs(roll.found - roll_deg) < min(2 * roll.deviation, 0.06 if turn_deg == 360 else 0.15)
+    assert abs(roll.found - roll_deg) < min(2 * roll.deviation, 0.045 if turn_deg == 360 else 0.15)
 
 
 def test_frames_of_beads_are_the_closed_form() -> None:
