@@ -34,6 +34,11 @@ _TOO_DENSE = 4.0  # (density that a ray would need in the grid) / (median densit
 _MATTER, _NOISES = 0.1, 4.0  # matter is above this fraction of the largest value, and above so many deviations of the noise
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 _AT_END = 0.1  # an object reaches beyond the first or last row if more than this fraction of its pixels shows matter
+# Standard deviation, in blocks, of the Gaussian that smooths frames of nearly parallel rays: of a grid narrower than this
+# fraction of its distance from the source. A row's rays stay in one slice in all views, so that errors of voxels, and of
+# edges narrower than a pixel, do not average out: with 0.8 a roll of 0.8° came out at 0.73°, unsmoothed at 0.6°.
+_SMOOTHING_NARROW, _NARROW = 1.6, 0.3
+_COLUMNS_NARROW = 16  # least blocks of pixels from left to right for this smoothing
 Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
 _LEAST_SHARE = 0.1  # least (expected cost of a phase's remaining passes) / (their full cost) in the progress
@@ -148,7 +153,7 @@ class CoarseProblem(CoarseFrames):
         """Returns the problem with the scans binned as ``stage`` says, and at most ``most_frames`` frames of each."""
         block = stage.block(scans[0])
         fewer = [coarse.fewer_frames(scan, most_frames) for scan in scans]
-        small = [coarse.binned(coarse.smooth(scan, _smoothing_px(scan, block)), block) for scan in fewer]
+        small = [coarse.binned(coarse.smooth(scan, _smoothing_px(scan, block, stage.is_cut)), block) for scan in fewer]
         grid = coarse.coarse_grid(scans[0].grid, small[0].geometry)
         problem = cls(rt=rt, grid=grid, **frames_of(fewer, small, block))
         if stage.is_cut or problem.matter_beside_grid() > _MOST_BESIDE:
@@ -266,11 +271,18 @@ def _is_matter(p: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
     return p > max(_NOISES * noise_level(p, valid), _MATTER * float(np.percentile(p, 99.9)))
 
 
-def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:
+def _smoothing_px(scan: Scan, block: int, is_cut: bool) -> float | tuple[float, float]:
     """Returns the standard deviations (v, u), in pixels, of the smoothing before binning. Rows that are read one after the
     other are not smoothed together: they see the object at different angles, and smoothed they would look like a shorter
-    readout. A readout by columns shears the image, and smoothing does not change the shear."""
-    if block == 1:
+    readout. A readout by columns shears the image, and smoothing does not change the shear.
+
+    Frames of nearly parallel rays are smoothed more, single pixels too: they stay frames of an object, a smoother one. Not
+    so where the panel's sides cut the object (``is_cut``), since smoothing mirrors it there, nor with few columns."""
+    cone, width_mm = scan.geometry, max(scan.grid.size_mm[1:])
+    is_narrow = not isinstance(cone, ConeGeometry) or width_mm < _NARROW * cone.source_to_axis_mm
+    is_smoother = is_narrow and not is_cut and cone.detector_shape[1] >= _COLUMNS_NARROW * block
+    if block == 1 and not is_smoother:
         return 0.0
+    smoothing_px = (_SMOOTHING_NARROW if is_smoother else coarse.SMOOTHING) * block
     is_rolling = scan.shutter.readout_s > 0 and scan.shutter.axis == "rows"
-    return 0.0 if is_rolling else coarse.SMOOTHING * block, coarse.SMOOTHING * block
+    return 0.0 if is_rolling else smoothing_px, smoothing_px

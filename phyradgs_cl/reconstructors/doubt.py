@@ -127,16 +127,23 @@ def finer(volume: Array) -> NDArray[np.float32]:
     return volume.astype(np.float32)
 
 
-def halves(scan: Scan) -> tuple[Array, Array]:
-    """Returns the frame numbers of both halves of a scan: every second view in the order of angles, and the others.
+def view_numbers(scan: Scan) -> Array:
+    """Returns the number (F,) of each frame's view, from 0 in the order of angles; frames of one angle are one view.
 
-    Views of one angle go to the same half: if both halves had this angle, their streaks would not differ. Every second frame
-    in the order of time is taken if there are fewer than 4 angles, or if the orbit travels along the axis, since each turn
-    then sees another height."""
+    Each frame is a view of its own, in the order of time, if there are fewer than 4 angles, or if the orbit travels along
+    the axis, since each turn then sees another height."""
     pose = middle_poses(scan)
     view, angles_rad = distinct_views(azimuth_rad(pose))
     if len(angles_rad) < FEWEST_FRAMES or travels(pose, scan.projections.shape[1], scan.is_parallel):
-        view = np.arange(scan.frames)
+        return np.arange(scan.frames)
+    return view
+
+
+def halves(scan: Scan) -> tuple[Array, Array]:
+    """Returns the frame numbers of both halves of a scan: every second view of ``view_numbers``, and the others.
+
+    Frames of one angle go to the same half: if both halves had this angle, their streaks would not differ."""
+    view = view_numbers(scan)
     return np.flatnonzero(view % 2 == 0), np.flatnonzero(view % 2 == 1)
 
 
@@ -201,7 +208,8 @@ class Doubter:
 
     def finished(self, results: list[Reconstruction]) -> Reconstruction:
         """Returns the first run's result with σ, facts about σ and the seconds of all runs; unchanged if all runs agree."""
-        law, first = fitted_law(self.kind).for_views(self.scan.frames, self.scan.grid), results[0]
+        views, first = int(view_numbers(self.scan).max()) + 1, results[0]  # repeated frames show no further view
+        law = fitted_law(self.kind).for_views(views, self.scan.grid)
         if all(np.array_equal(first.volume, other.volume) for other in results[1:]):
             log.warning("all three runs have the same volume: there are no error bars; give the method more iterations")
             return first

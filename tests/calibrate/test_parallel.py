@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from parallel_kit import BODIES, SIDE, laminography_scan, line_integrals, parallel_scan
+from parallel_kit import BODIES, GRID, SIDE, laminography_scan, line_integrals, parallel_scan
 
-from phyradgs_cl.acquisition import Shutter
+from phyradgs_cl.acquisition import ConeGeometry, Shutter, pixel_centres
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb
+from phyradgs_cl.api import static_scan
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
 from phyradgs_cl.calibrate.beads import BeadProblem
 from phyradgs_cl.calibrate.parameters import requested
@@ -65,6 +66,26 @@ def test_an_offset_and_a_roll_are_found_in_half_a_turn_and_a_right_scan_is_left_
     assert result.residual_rms[1] < 0.5 * result.residual_rms[0]
     right = calibrate(parallel_scan(), rt)
     assert right.corrected == [] and right.parameters[0].verdict == AGREES
+
+
+@pytest.mark.parametrize(
+    ("so_mm", "turn_deg", "off_mm", "roll_deg"), [(0, 360, 0.15, -0.9), (0, 180, -0.1, 1.2), (60, 360, 0.15, -0.9)]
+)
+def test_the_roll_of_sharp_edges_is_whole_in_rays_that_stay_in_a_slice(rt, so_mm, turn_deg, off_mm, roll_deg) -> None:
+    """Single pixels, whose errors at edges took a tenth to a quarter of the roll; in half a turn all of it."""
+    scan = parallel_scan(40, turn_deg)
+    if so_mm:
+        cone, angles_deg = ConeGeometry(so_mm, 1.4 * so_mm, (SIDE, SIDE), (0.14, 0.14)), 17 + 9.0 * np.arange(40)
+        scan = static_scan(np.zeros_like(scan.projections), cone, angles_deg, grid=GRID)
+    poses = poses_of(perturb(scan, GeometryCorrection(offset_u_mm=off_mm, roll_rad=np.deg2rad(roll_deg))))
+    frames = seen_by(poses)
+    if so_mm:
+        frames = BODIES.line_integrals(poses[:, None, None, :3], pixel_centres(poses, (SIDE, SIDE)))
+    noisy = frames + np.random.default_rng(2).normal(0, 0.003, frames.shape)
+    offset, roll = calibrate(replace(scan, projections=noisy.astype(np.float32)), rt, "offset-u,roll").parameters
+    assert offset.verdict == roll.verdict == CORRECTED
+    assert abs(offset.found - off_mm) < min(2 * offset.deviation, 0.002)
+    assert abs(roll.found - roll_deg) < min(2 * roll.deviation, 0.045 if turn_deg == 360 else 0.15)
 
 
 def test_frames_of_beads_are_the_closed_form() -> None:

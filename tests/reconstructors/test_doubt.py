@@ -18,9 +18,9 @@ from phyradgs_cl.io import read_checkpoint, write_checkpoint
 from phyradgs_cl.metrics import coverage
 from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.reconstructors import doubt
-from phyradgs_cl.reconstructors.doubt import Doubter, Law, finer, halves, spread, widening
+from phyradgs_cl.reconstructors.doubt import Doubter, Law, finer, fitted_law, halves, spread, widening
 from phyradgs_cl.reconstructors.projected import held_out
-from phyradgs_cl.reconstructors.result import DOUBT, interrupted
+from phyradgs_cl.reconstructors.result import DOUBT, Reconstruction, interrupted
 
 FEW = {"method": "sirt", "iterations": 4, "report": False}
 LAW = Law(1.0, 1.0, 0.0, 0.0, 0.55, 3.0)
@@ -97,6 +97,21 @@ def test_halves_are_of_angles_and_not_of_time(rt) -> None:
     travelling[:, [2, 5]] += np.linspace(-20, 20, 30)[:, None]
     helix = Scan.from_poses(twice.projections, travelling, twice.grid)
     assert [half.tolist() for half in halves(helix)] == [[*range(0, 30, 2)], [*range(1, 30, 2)]]
+
+
+def test_repeated_frames_are_no_further_views_of_the_bars(rt) -> None:
+    """A fifth turn over the same angles adds none; frames of a helix, and of fewer than 4 angles, all count."""
+    turn = simulate("spheres", views=15, size=12, detector=16, protocol="static", device=rt)
+    again = some_frames(turn, np.tile(np.arange(15), 5))
+    moving = middle_poses(again)
+    moving[:, [2, 5]] += np.linspace(-20, 20, 75)[:, None]
+    helix, few = Scan.from_poses(again.projections, moving, again.grid), some_frames(turn, [0, 5, 0, 5, 0])
+    volumes = np.random.default_rng(4).random((3, *turn.grid.shape)).astype(np.float32)
+    runs = [Reconstruction(volume, turn.grid, facts={"seconds": 1.0}) for volume in volumes]
+    for scan, views in ((turn, 15), (again, 15), (helix, 75), (few, 5)):
+        law = fitted_law("iterative").for_views(views, turn.grid)
+        result = Doubter(rt, scan, scan, None, None, 0).finished(runs)
+        np.testing.assert_allclose(result.doubt, spread(*volumes, law), rtol=1e-6)
 
 
 def test_bars_follow_slopes_density_shape_and_noise() -> None:
