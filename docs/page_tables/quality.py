@@ -143,12 +143,11 @@ def ridge() -> str:
     return markdown(["scan", "views", "photons", "voxels", "`dct`", "`ridge`", "mean gain", "least"], text)
 
 
-@table("prior_weight", "prior_weight.jsonl", False)
-@table("passes", "passes.jsonl", True)
-def sweep(name: str, held_out: bool) -> str:
-    """Returns PSNR with the default of an option, and with the best one factor for all volumes, as means over volumes."""
+@table("prior_weight")
+def prior_weight() -> str:
+    """Returns PSNR with the default weight, and with the best one factor for all volumes, as means over volumes."""
     scans: dict[tuple[Any, ...], dict[str, dict[float, dict[str, Any]]]] = {}
-    for line in lines_of(name):
+    for line in lines_of("prior_weight.jsonl"):
         key = (line["kind"], line["views"], int(line["dose"]), line["size"], line["pixels"])
         scans.setdefault(key, {}).setdefault(line["volume"], {})[line["factor"]] = line
     text = []
@@ -159,15 +158,9 @@ def sweep(name: str, held_out: bool) -> str:
         best = max(of_factor, key=of_factor.__getitem__)
         cells = [kind, str(views), str(dose), f"{size}³, {pixels}²", f"{of_factor[1.0]:.2f}"]
         cells.append(f"{of_factor[best]:.2f} (×{best:g})")
-        if best == 1.0 and not held_out:
-            continue
-        if held_out:
-            least = [min(by.values(), key=lambda line: line["holdout_rms"])["psnr_db"] for by in volumes.values()]
-            cells.append(f"{mean(least):.2f}")
-        text.append(cells)
+        if best != 1.0:
+            text.append(cells)
     heads = ["scan", "views", "photons", "voxels, pixels", "default", "best factor for all"]
-    if held_out:
-        return markdown([*heads, "least held-out error"], text)
     others = len(scans) - len(text)
     return markdown(heads, text) + f"\nOf the other {others} kinds of scans the default is the best factor.\n"
 
