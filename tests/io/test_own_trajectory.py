@@ -10,7 +10,6 @@ from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_scan, write_scan
-from phyradgs_cl.io.scan.motion import sampled
 from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
 
 pytestmark = pytest.mark.slow
@@ -41,18 +40,16 @@ def apart_mm(table: PoseTable, scan: Scan) -> float:
     return max(np.abs(table.pose(*at) - scan.trajectory.pose(*at)).max() for at in times)
 
 
-@pytest.mark.parametrize("every_s", [1.25, 0.7, 0.5], ids=["with pauses", "without", "frames that overlap"])
+EVERY_S = {"with pauses": 1.25, "without": 0.7, "frames that overlap": 0.5, "samples between samples": 0.350001}
+
+
+@pytest.mark.parametrize("every_s", EVERY_S.values(), ids=EVERY_S)
 def test_it_is_saved_as_a_table_that_follows_it(tmp_path, every_s) -> None:
+    """Where frames come every half span, samples of one lie between another's, where a table is right of itself."""
     scan = scan_on(Wobbling(), every_s)
     write_scan(tmp_path / "s.h5", scan)
     found = read_scan(tmp_path / "s.h5", counts_to_attenuation)
     assert isinstance(found.trajectory, PoseTable) and found.is_fly and apart_mm(found.trajectory, scan) <= 2e-4 * 5.0
-
-
-def test_where_frames_overlap_the_table_follows_between_their_samples() -> None:
-    """Samples of one frame lie in the middle between another's, where a table is right of itself."""
-    scan = scan_on(Wobbling(), 0.350001)  # half a span
-    assert apart_mm(sampled(scan.trajectory, scan.frame_start_s, 0.7, 1e-3), scan) <= 1.2e-3
 
 
 def test_every_kind_of_method_follows_it(rt, tmp_path) -> None:

@@ -14,7 +14,7 @@ from phyradgs_cl.acquisition.plausible import blur_facts
 from phyradgs_cl.api import FrameSweeps, MicroViews, PoseTable, Scan, Shutter, SpeedRamp, Static
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Gating, Grid
+from phyradgs_cl.fields import Gating
 from phyradgs_cl.io import file_kind, read_scan, scan_summary, sha256_of, write_scan
 
 ANGLE_TOLERANCE_RAD = 1e-12  # degrees in the file: two roundings of angles of order 1
@@ -101,14 +101,14 @@ def test_a_signal_of_poses_at_rest_moves_with_them(path, make_scan) -> None:
 
 
 def test_a_signal_beside_flats_and_darks_comes_back(path, make_scan) -> None:
-    scan, key, data = counts_scan(make_scan)
+    scan, counts = counts_scan(make_scan)
     for is_phase, name in ((False, "a signal"), (True, "a phase")):
         gating = Gating(scan.frame_start_s + scan.shutter.span_s / 2, np.linspace(0, 0.9, scan.frames) ** 2, is_phase)
-        again = again_of(path, replace(scan, gating=gating), data=data, image_key=key, quantity="counts").gating
+        again = again_of(path, replace(scan, gating=gating), **counts).gating
         assert again.is_phase == is_phase and scan_summary(path)["gating"] == name
         np.testing.assert_array_equal([again.times_s, again.values], [gating.times_s, gating.values])
         with h5py.File(path, "r+") as file:
-            file["entry/phyradgs/gating"]["signal" if is_phase else "phase"] = np.zeros(len(key))
+            file["entry/phyradgs/gating"]["signal" if is_phase else "phase"] = np.zeros(9)
         with pytest.raises(InputError, match="gating/signal: found a signal beside a phase"):
             again_of(path)
 
@@ -156,11 +156,9 @@ def test_standing_gantry_stays_static_with_the_same_poses(path, make_scan) -> No
     same_cells(Static(), pulsed, again)
 
 
-def test_shutters_and_an_anisotropic_grid_come_back(path, make_scan) -> None:
+def test_shutters_come_back(path, make_scan) -> None:
     for shutter in map(Shutter, 8 * [0.8], 4 * [0.0, 0.3], 4 * ["rows"] + 4 * ["columns"], 2 * [1, 1, -1, -1]):
         assert again_of(path, make_scan(shutter=shutter)).shutter == shutter
-    grid = Grid((2, 3, 4), (0.1, 0.2, 0.3), (5.0, 6.0, 7.0))
-    assert again_of(path, make_scan(grid=grid)).grid == grid
 
 
 @pytest.mark.parametrize("is_fly", [True, False])
@@ -204,25 +202,24 @@ def test_poses_win_over_encoder_over_angles(path, make_scan, tmp_path) -> None:
     same_poses(with_encoder, again_of(path))
 
 
-def counts_scan(make_scan):
-    """Raw counts made here with flats, darks and an invalid frame between the projections."""
+def counts_scan(make_scan) -> tuple[Scan, dict[str, object]]:
+    """A scan, and as how it is to be stored: raw counts with flats, darks and an invalid frame between the projections."""
     scan, key = make_scan(), np.array([1, 2, 0, 0, 3, 1, 0, 2, 0])
     flat, dark = np.linspace(40000, 50000, 15).reshape(3, 5), np.linspace(90, 110, 15).reshape(3, 5)
     data = np.empty((len(key), 3, 5))
     data[key == 1], data[key == 2], data[key == 3] = flat, dark, 12345
     data[key == 0] = dark + (flat - dark) * np.exp(-scan.projections)
-    return scan, key, np.round(data).astype(np.uint16)
+    return scan, {"data": np.round(data).astype(np.uint16), "image_key": key, "quantity": "counts"}
 
 
 def test_counts_lose_flats_darks_and_invalid_frames(path, make_scan) -> None:
-    scan, key, data = counts_scan(make_scan)
-    write_scan(path, scan, data=data, image_key=key, quantity="counts")
+    scan, counts = counts_scan(make_scan)
+    again, data = again_of(path, scan, **counts), counts["data"]
     with h5py.File(path) as file:
         assert file["entry/instrument/detector/data"].dtype == np.uint16
         assert all(len(file[name]) == 9 for name in ("entry/sample/rotation_angle", "entry/data/image_key"))
-    again = again_of(path)
     flat, dark = data[:2].astype(float)
-    expected = -np.log((data[key == 0] - dark) / (flat - dark))
+    expected = -np.log((data[counts["image_key"] == 0] - dark) / (flat - dark))
     np.testing.assert_allclose(again.projections, expected, rtol=0, atol=2e-6)  # float32 near 4
     np.testing.assert_allclose(again.frame_start_s, scan.frame_start_s)
     same_poses(scan, again)
@@ -231,17 +228,14 @@ def test_counts_lose_flats_darks_and_invalid_frames(path, make_scan) -> None:
 
 def test_masks_of_frames_follow_their_frames(path, make_scan) -> None:
     """And pixels that the conversion rejects join the mask."""
-    scan, key, data = counts_scan(make_scan)
-    how, mask = {"image_key": key, "quantity": "counts"}, np.zeros((4, 3, 5), np.int32)
+    (scan, counts), mask = counts_scan(make_scan), np.zeros((4, 3, 5), np.int32)
     mask[[0, 1, 2, 3], [0, 1, 2, 0], [4, 3, 2, 1]] = [1, 2, 64, 256]  # NeXus puts reasons into bits
-    again = again_of(path, replace(scan, pixel_mask=mask), data=data, **how)
-    np.testing.assert_array_equal(again.pixel_mask, mask != 0)
+    np.testing.assert_array_equal(again_of(path, replace(scan, pixel_mask=mask), **counts).pixel_mask, mask != 0)
     mask = np.arange(15).reshape(3, 5) == 14
-    data[6, 1, 1] = 0  # below the dark: third projection
+    counts["data"][6, 1, 1] = 0  # below the dark: third projection
     expected = np.repeat(mask[None], 4, 0)
     expected[2, 1, 1] = True
-    again = again_of(path, replace(scan, pixel_mask=mask), data=data, **how)
-    np.testing.assert_array_equal(again.pixel_mask, expected)
+    np.testing.assert_array_equal(again_of(path, replace(scan, pixel_mask=mask), **counts).pixel_mask, expected)
 
 
 def test_transmission_is_converted_and_masked_pixels_may_be_nan(path, make_scan) -> None:
@@ -333,8 +327,8 @@ def test_another_entry_name_and_inner_links_are_followed(path, make_scan) -> Non
 
 
 def test_summary_tells_shape_timing_and_hash(path, make_scan) -> None:
-    scan, key, data = counts_scan(make_scan)
-    write_scan(path, scan, data=data, image_key=key, quantity="counts")
+    scan, counts = counts_scan(make_scan)
+    write_scan(path, scan, **counts)
     facts = scan_summary(path)
     expected = {"projections": 4, "flats": 2, "darks": 2, "invalid": 1, "fly_scan": True, "reference": False}
     assert {name: facts[name] for name in expected} == expected and facts["exposure_arc_deg"] == pytest.approx(3.0)
@@ -345,9 +339,8 @@ def test_summary_tells_shape_timing_and_hash(path, make_scan) -> None:
 
 def test_a_summary_has_no_times_of_a_scan_that_stops_and_counts_the_flats_that_were_applied(path, make_scan) -> None:
     """Where frames start that stand still is their order alone, in units of a second."""
-    made, key, data = counts_scan(make_scan)
-    write_scan(path, made, data=data, image_key=key, quantity="counts")
-    write_scan(path, read_scan(path, counts_to_attenuation))  # as `prepare` does
+    made, counts = counts_scan(make_scan)
+    write_scan(path, again_of(path, made, **counts))  # as `prepare` does
     facts = scan_summary(path)
     assert (facts["flats"], facts["flats_applied"], facts["darks_applied"]) == (0, 2, 2) and "scan_s" in facts
     angle_rad = np.deg2rad([10.0, 25.0, 40.0, 58.0])
@@ -362,14 +355,12 @@ def test_a_summary_has_no_times_of_a_scan_that_stops_and_counts_the_flats_that_w
 
 
 def test_arguments_that_do_not_fit_are_refused(path, make_scan) -> None:
-    scan, key, data = counts_scan(make_scan)
+    scan, counts = counts_scan(make_scan)
+    wrong = {"image_key": counts["image_key"][:-1]}, {"image_key": np.zeros(9, int)}, {"data": counts["data"][:, :, :4]}
     for arguments in (
         {"quantity": "hounsfield"}, {"quantity": "counts"},
-        {"data": data, "image_key": key, "quantity": "attenuation"},
-        {"data": data, "image_key": key[:-1], "quantity": "counts"},
-        {"data": data, "image_key": np.zeros(9, int), "quantity": "counts"},
-        {"data": data[:, :, :4], "image_key": key, "quantity": "counts"},
-    ):
+        *(counts | change for change in ({"quantity": "attenuation"}, *wrong)),
+    ):  # fmt: skip
         with pytest.raises(InputError):
             write_scan(path, scan, **arguments)
     with pytest.raises(InputError, match="exposure"):

@@ -198,21 +198,12 @@ def grids(draw: st.DrawFn) -> Grid:
 @pytest.mark.slow
 @many
 @given(scanner=tables(), grid=grids(), seed=seeds)
-def test_rays_of_random_scanners(rt, scanner, grid, seed) -> None:
-    shape, cells = scanner
-    operator = rays(rt, cells, grid, shape)
-    is_adjoint(operator, seed)
-    is_linear(operator, seed)
-
-
-@pytest.mark.slow
-@many
-@given(scanner=tables(), seed=seeds)
-def test_splats_of_random_scanners(rt, make_cloud, scanner, seed) -> None:
+def test_rays_and_splats_of_random_scanners(rt, make_cloud, scanner, grid, seed) -> None:
     shape, cells = scanner
     rows = make_cloud(4, seed, spread=0.7, scale=(0.08, 0.5))
-    is_adjoint(densities(rt, cells[:1], rows, shape), seed)
-    is_linear(densities(rt, cells[:1], rows, shape), seed)
+    for operator in (rays(rt, cells, grid, shape), densities(rt, cells[:1], rows, shape)):
+        is_adjoint(operator, seed)
+        is_linear(operator, seed)
 
 
 @many

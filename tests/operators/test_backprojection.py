@@ -34,8 +34,8 @@ def line_poses(geometry: ConeGeometry, lines: int, turn_rad: float) -> np.ndarra
     return np.stack([geometry.pose(a + np.linspace(-0.5, 0.5, lines) * turn_rad) for a in ANGLES])
 
 
-def assert_same(found: np.ndarray, expected: np.ndarray, scale: float = 1.0, least: int = 10) -> None:
-    assert np.count_nonzero(expected) > least
+def assert_same(found: np.ndarray, expected: np.ndarray, scale: float = 1.0) -> None:
+    assert np.count_nonzero(expected) > 10
     np.testing.assert_allclose(found, expected, rtol=0, atol=BACKPROJECTION * scale)
 
 
@@ -112,23 +112,13 @@ def test_voxels_behind_the_source_receive_nothing(two_rt, make_geometry: Geometr
     assert_same(backproject_lines(two_rt, frames, lines, weight, grid), expected, near)
 
 
-def test_single_lines_of_pixels(two_rt, make_geometry: Geometries) -> None:
-    """A voxel's centre is seldom exactly on a single line; on the mid-plane of this grid it is."""
-    grid = Grid((1, 1, 1), (0.1, 0.1, 0.1))
-    for shape in ((1, 9), (9, 1), (1, 1)):
-        frames, weight = random_frames(shape)
-        pose = make_geometry(*shape).pose(np.zeros(4))
-        expected = backprojection(frames, pose, weight, grid)
-        assert_same(backproject(two_rt, frames, pose, weight, grid), expected, least=0)
-
-
 @pytest.mark.parametrize("shape", [(1, 9), (9, 1), (1, 1), (5, 9)])
 def test_rounding_moves_no_voxel_off_the_panel(two_rt, make_geometry: Geometries, shape) -> None:
-    """The voxel lies on the first row, or the middle column, but for 0.0004 pixels; by every kernel."""
+    """The voxel lies on the first row, or the middle column, exactly or but for 0.0004 pixels; by every kernel."""
     frames, weight = random_frames(shape)
     pose = make_geometry(*shape).pose(np.zeros(4))
     pose[:, 3:6] += (shape[0] - 1) / 2 * pose[:, 9:12]
-    for tilt, away in product((0.0, 0.02, 0.3), (-4e-4, 4e-4)):
+    for tilt, away in product((0.0, 0.02, 0.3), (-4e-4, 0.0, 4e-4)):
         moved = pose + np.concatenate([np.zeros((4, 9)), tilt * pose[:, 6:9]], 1)
         for side in (6, 9):
             moved[:, 3:6] += away * moved[:, side : side + 3]

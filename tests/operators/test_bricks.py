@@ -80,7 +80,8 @@ def test_indices_of_64_bits_change_nothing_in_bricks(two_rt, monkeypatch) -> Non
     ((13, 18), 0.0, "columns"),
 ], ids=["upright", "tilted", "blocks along z", "rows", "columns"])  # fmt: skip
 def test_backprojection(two_rt, make_geometry, pixels, tilt, axis) -> None:
-    """Of frames, and of lines that have poses of their own."""
+    """Of frames, and of lines that have poses of their own. Frames that are on the device give the same bits; only poses and
+    weights go up."""
     grid, rng, count = Grid((11, 9, 19), (0.12, 0.2, 0.1)), np.random.default_rng(94), 9 if axis else 67
     views, weight = rng.uniform(-1, 1, (count, *pixels)).astype(np.float32), rng.uniform(0.5, 1, count)
     angles = rng.uniform(0, 6, (count, 1)) + np.linspace(-0.1, 0.1, pixels[axis == "columns"])
@@ -95,6 +96,15 @@ def test_backprojection(two_rt, make_geometry, pixels, tilt, axis) -> None:
     for nbytes in room:
         with room_for(two_rt, nbytes):
             np.testing.assert_array_equal(project(two_rt, views, *seen), expected)
+    on_device, numbers = two_rt.upload(views), count * (12 * angles.shape[1] + 1) if axis else count * 13
+    for nbytes in (10**7, 40_000 + room[0]):
+        with room_for(two_rt, nbytes):
+            before = replace(two_rt.traffic)
+            volume = project(two_rt, on_device, *seen)
+            assert two_rt.traffic.bytes_down == before.bytes_down
+            assert two_rt.traffic.bytes_up - before.bytes_up <= 4 * numbers * 9
+            np.testing.assert_array_equal(two_rt.download(volume), expected)
+            del volume
 
 
 def test_what_does_not_fit_at_all_is_said_of_the_memory_and_of_arrays_on_the_device(rt, make_cloud) -> None:
@@ -159,30 +169,3 @@ def test_lists_of_too_many_entries_are_made_for_smaller_bricks(rt, make_cloud, m
     rt.launch(rt.kernel("binning", "bin_starts"), 1, np.int32(4), starts)
     largest = 2**31 - 1
     np.testing.assert_array_equal(rt.download(starts), [0, 2**30, largest, largest, largest])
-
-
-def test_backprojection_of_frames_on_the_device(two_rt, make_geometry) -> None:
-    """Frames that are on the device give the same bits; only poses and weights go up."""
-    grid, pixels, rng = Grid((11, 9, 19), (0.12, 0.2, 0.1)), (13, 18), np.random.default_rng(38)
-    geometry, frames = make_geometry(*pixels), rng.uniform(-1, 1, (9, *pixels)).astype(np.float32)
-    angles = [rng.uniform(0, 6, (9, 1)) + np.linspace(-0.1, 0.1, lines) for lines in pixels]
-    by_rows, by_columns = (geometry.pose(a.ravel()).reshape(*a.shape, 12) for a in angles)
-    tilted = by_rows[:, 0].copy()
-    tilted[:, 9:12] += 0.05 * tilted[:, 6:9]
-    views = two_rt.upload(frames)
-    calls = {
-        "rows": lambda y: backproject_lines(two_rt, y, by_rows, np.ones(9), grid, "rows"),
-        "columns": lambda y: backproject_lines(two_rt, y, by_columns, np.ones(9), grid, "columns"),
-        "upright": lambda y: backproject(two_rt, y, by_rows[:, 0], np.ones(9), grid),
-        "tilted": lambda y: backproject(two_rt, y, tilted, np.ones(9), grid),
-    }
-    for name, call in calls.items():
-        expected = call(frames)
-        for room in (10**7, 40_000):
-            with room_for(two_rt, room):
-                before = replace(two_rt.traffic)
-                volume = call(views)
-                assert two_rt.traffic.bytes_down == before.bytes_down
-                assert two_rt.traffic.bytes_up - before.bytes_up <= 4 * 9 * (12 * pixels[name == "columns"] + 1) * 9
-                np.testing.assert_array_equal(two_rt.download(volume), expected, err_msg=name)
-                del volume

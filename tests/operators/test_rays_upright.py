@@ -56,16 +56,18 @@ def assert_volume(found: np.ndarray, cells: list[TimeCells], y: np.ndarray, grid
     [("static", TALL_PANEL), ("static", (131, 18)), ("static", (96, 1)), ("micro-views", (131, 6)), ("common", TALL_PANEL)],
 )
 def test_frames_are_the_twins(cpu_rt, monkeypatch, motion, shape) -> None:
-    """Of a pose that serves all lines to the bits of the general kernel."""
+    """Of a pose that serves all lines to the bits of the general kernel; of several also as averages of intensities."""
     cells, x = tables(motion, shape, frames=2), noise(GRID.shape, 101)
     with monkeypatch.context() as patch:
         launched = note_launches(patch)
         frames = RayOperator(cpu_rt, GRID, shape, cells).forward(x)
     merged = {"merge_slots"} if motion != "static" else set()
     assert set(launched) == {"turn_upright", "rays_upright"} | merged
+    assert_frames(frames, cells, x, shape)
     if motion == "static":
         assert_same_bits(cpu_rt, GRID, cells, x, shape)
-    assert_frames(frames, cells, x, shape)
+    else:
+        assert_frames(IntensityOperator(cpu_rt, GRID, shape, cells).expected(x), cells, x, shape, "intensity")
 
 
 CLOSE = Grid((9, 30, 30), (0.05, 2 / 30, 2 / 30))
@@ -110,12 +112,6 @@ def test_a_subset_batches_of_frames_and_no_room_for_the_turned_volume(banded_rt,
         assert set(launched) == {"rays_forward"}
 
 
-@pytest.mark.parametrize("motion", ["micro-views", "common"])
-def test_intensities(cpu_rt, motion) -> None:
-    cells, x = tables(motion, TALL_PANEL), noise(GRID.shape, 107)
-    assert_frames(IntensityOperator(cpu_rt, GRID, TALL_PANEL, cells).expected(x), cells, x, model="intensity")
-
-
 @pytest.mark.parametrize(("motion", "axis", "lean_deg", "shape"), [
     ("static", "rows", (0.01, 0.0), (85, 40)), ("static", "rows", (5.0, -6.0), (40, 131)),
     ("common", "rows", (-5.0, 3.0), (85, 40)), ("common", "columns", (0.3, 0.5), (40, 131)),
@@ -133,29 +129,19 @@ def test_panels_that_lean(cpu_rt, motion, axis, lean_deg, shape) -> None:
     assert np.abs(volume - plain.adjoint(y)).max() <= RAYS_BACK * volume.max()
 
 
-def test_frames_without_gaps_share_their_poses(cpu_rt, monkeypatch) -> None:
-    """The end of a frame and the beginning of the next are projected once; a subset of frames has the same bits."""
+@pytest.mark.parametrize(("motion", "count"), [("gapless", 4), ("overlapping", 2)])
+def test_frames_without_gaps_share_their_poses_and_slots_stay_within_their_memory(cpu_rt, motion, count) -> None:
+    """The end of a frame and the beginning of the next are projected once. Where their last and first lines are exposed
+    together, a slot of both would have all lines."""
     shape = (85, 3)
-    cells, x = tables("gapless", shape, frames=4), noise(GRID.shape, 115)
+    cells, x, y = tables(motion, shape, frames=count), noise(GRID.shape, 115), noise((count, *shape), 116)
     operator = RayOperator(cpu_rt, GRID, shape, cells)
-    frames = operator.forward(x)
-    slots = operator._slots[(0, 4)]
-    assert slots.count < sum(table.count for table in cells) - 5
-    assert_frames(frames, cells, x, shape)
-    y = noise((4, *shape), 116)
-    assert_volume(operator.adjoint(y), cells, y)
-    np.testing.assert_allclose(operator.subset([2, 0]).forward(x), frames[[2, 0]], rtol=0, atol=RAYS * frames.max())
-
-
-def test_slots_stay_within_their_memory_where_lines_far_apart_share_a_pose(cpu_rt) -> None:
-    """The last lines of a frame and the first of the next are exposed together: a slot of both would have all lines."""
-    shape = (85, 4)
-    cells, x, y = tables("overlapping", shape, frames=2), noise(GRID.shape, 117), noise((2, *shape), 118)
-    operator = RayOperator(cpu_rt, GRID, shape, cells)
-    frames = operator.forward(x)
-    assert operator._slots[(0, 2)].floats <= 2 * operator.slot_floats
+    frames, slots = operator.forward(x), operator._slots[(0, count)]
+    assert slots.count < sum(table.count for table in cells) - 5 or motion == "overlapping"
+    assert slots.floats <= count * operator.slot_floats
     assert_frames(frames, cells, x, shape)
     assert_volume(operator.adjoint(y), cells, y)
+    np.testing.assert_allclose(operator.subset([1, 0]).forward(x), frames[[1, 0]], rtol=0, atol=RAYS * frames.max())
 
 
 ADJOINTS = {

@@ -24,7 +24,7 @@ from phyradgs_cl.runtime.layout import unpad_rows
 SIDE = 512
 CROP = 32
 LARGE = ConeGeometry(5.0, 7.5, (SIDE, SIDE), (3.9 / SIDE, 4.1 / SIDE))
-PANELS, ORDER, REACH_SIGMA = 400, 10, 12.0  # of the integrals along rays that know no closed form
+SAMPLES, REACH_SIGMA = 4001, 12.0  # of the integrals along rays that know no closed form
 PIXEL_AT_AXIS = LARGE.pixel_size_mm[0] / LARGE.magnification
 
 
@@ -168,15 +168,12 @@ def density_at(row: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def integrate(row: np.ndarray, source: np.ndarray, target: np.ndarray) -> float:
-    """The field along the line through source and target, by Gauss–Legendre in panels."""
+    """The field along the line through source and target, by the trapezoidal rule, which is exact to rounding here."""
     direction = (target - source) / np.linalg.norm(target - source)
-    middle = direction @ (row[:3] - source)
     reach = REACH_SIGMA * row[3:6].max()
-    edges = np.linspace(middle - reach, middle + reach, PANELS + 1)
-    node, weight = np.polynomial.legendre.leggauss(ORDER)
-    half = np.diff(edges)[:, None] / 2
-    at = (edges[:-1, None] + half * (1 + node)).ravel()
-    return float((half * weight).ravel() @ density_at(row, source + at[:, None] * direction))
+    at, step = np.linspace(-reach, reach, SAMPLES, retstep=True)
+    at += direction @ (row[:3] - source)
+    return float(step * density_at(row, source + at[:, None] * direction).sum())
 
 
 @pytest.mark.parametrize("seed", range(3))

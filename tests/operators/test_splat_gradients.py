@@ -1,10 +1,9 @@
 """The splat's adjoint against central differences of its float64 twin, a class of parameters at a time."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from kernel_kit import MODELS, READOUTS, assert_classes, assert_near, by_gaussian, frame_cells, random_weights
+from kernel_kit import splat as render
 from tolerances import CUTOFF_EDGE_SIGMA, FLOAT64, GRADIENT
 
 from phyradgs_cl.acquisition import Shutter
@@ -17,13 +16,6 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.layout import pad_rows
 
 SHAPE = (13, 18)
-
-
-@pytest.fixture(params=READOUTS, ids=str)
-def make_table(request, make_geometry) -> Callable[[str], TimeCells]:
-    """Tables of one frame, read out along rows or columns, either way."""
-    geometry, shutter = make_geometry(*SHAPE, offset=(0.15, -0.25)), Shutter(0.8, 0.6, *request.param)
-    return lambda motion: frame_cells(motion, geometry, shutter=shutter)
 
 
 def device_gradients(rt, rows: np.ndarray, table: TimeCells, h: np.ndarray, **options: object) -> np.ndarray:
@@ -81,10 +73,13 @@ def test_with_cutoff_only_drawn_pixels_pull(two_rt, make_cloud, make_geometry, f
     assert_classes(device_gradients(two_rt, rows, table, h), expected, GRADIENT)
 
 
-def test_what_is_not_drawn_has_no_gradient(two_rt, make_cloud, make_geometry, one_cell) -> None:
-    table = one_cell(make_geometry(*SHAPE).pose(0.0), SHAPE[0])
+@pytest.mark.parametrize("motion", ["static", "exact"])
+def test_what_is_not_drawn_has_no_gradient(two_rt, make_cloud, make_geometry, motion) -> None:
+    table = frame_cells(motion, make_geometry(*SHAPE))
     rows = make_cloud(3, 25, scale=(0.05, 0.1))
-    rows[0, 1], rows[1, 2] = 9.0, 4.0  # behind the source; off the detector
+    rows[:3, 1], rows[1, 2] = (9.0, 3.0, 0.2), 4.0  # behind the source at any time; off the detector
+    frames = (render(two_rt, some, table, SHAPE) for some in (rows, rows[:, :1]))
+    np.testing.assert_array_equal(*frames)
     found = device_gradients(two_rt, rows, table, random_weights(SHAPE))
     np.testing.assert_array_equal(found[:, 1:], 0)
     assert np.all(np.isfinite(found)) and np.any(found[:, 0])
@@ -123,12 +118,14 @@ def image_with_moved_centre(
     return np.linalg.norm(ray, axis=-1) * row[10] * np.sqrt(2 * np.pi / alpha / big_q) * np.exp(-q / 2)
 
 
+@pytest.mark.parametrize("readout", READOUTS, ids=str)
 @pytest.mark.parametrize("motion", ["static", "micro-views"])
 def test_statistic_rows_are_the_gradient_by_the_seen_centre(
-    rt, make_cloud, make_table, finite_differences, motion
+    rt, make_cloud, make_geometry, finite_differences, motion, readout
 ) -> None:
     """Rows 11 and 12: across the lines and along the readout, per half the detector's width."""
-    rows, table, h = make_cloud(3, 26, scale=(0.05, 0.3)), make_table(motion), random_weights(SHAPE)
+    table = frame_cells(motion, make_geometry(*SHAPE, offset=(0.15, -0.25)), shutter=Shutter(0.8, 0.6, *readout))
+    rows, h = make_cloud(3, 26, scale=(0.05, 0.3)), random_weights(SHAPE)
     found = device_gradients(rt, rows, table, h, cutoff_sigma=0.0)[11:]
 
     def frame(row: np.ndarray, shift: np.ndarray) -> np.ndarray:

@@ -1,12 +1,15 @@
 """A small fly-scan with its truth, and a reconstruction of it, as files."""
 
+import base64
 import importlib.util
 from collections.abc import Callable
 from html.parser import HTMLParser
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from skimage.io import imread
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
@@ -49,6 +52,12 @@ class Page(HTMLParser):
     @property
     def ids(self) -> list[str]:
         return [attributes["id"] for _, attributes in self.elements if "id" in attributes]
+
+    @staticmethod
+    def pixels(source: str) -> np.ndarray:
+        kind, _, content = source.partition(",")
+        assert kind == "data:image/png;base64"
+        return imread(BytesIO(base64.b64decode(content, validate=True)))
 
     @property
     def words(self) -> str:

@@ -2,11 +2,9 @@
 
 import base64
 import json
-from io import BytesIO
 
 import numpy as np
 import pytest
-from skimage import io
 
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.report.atlas import MOST_CENTRES, MOST_EDGE, MOST_TEXT, space
@@ -21,9 +19,9 @@ def data_of(parse, *arguments: object) -> dict:
     return json.loads(page.texts["script"][0])
 
 
-def voxels_of(data: dict) -> np.ndarray:
+def voxels_of(parse, data: dict) -> np.ndarray:
     """The voxels (nz, ny, nx) uint8 that the page's script reads from the atlas."""
-    sheet = io.imread(BytesIO(base64.b64decode(data["atlas"], validate=True)))
+    sheet = parse.pixels("data:image/png;base64," + data["atlas"])
     nx, ny, nz = data["counts"]
     rows, columns = (np.arange(nz) // data["columns"], np.arange(nz) % data["columns"])
     return np.stack([sheet[r * ny : (r + 1) * ny, c * nx : (c + 1) * nx] for r, c in zip(rows, columns, strict=True)])
@@ -39,7 +37,7 @@ def test_the_atlas_has_every_voxel_in_the_steps_of_the_slices(any_volume, parse)
     window = Window.of(50.0, 400.0, volume)
     data = data_of(parse, volume, grid, window, None)
     assert data["counts"] == [8, 6, 5] and data["size_mm"] == pytest.approx([0.8, 1.2, 1.5])
-    assert np.array_equal(voxels_of(data), bytes_of(volume, window.least, window.most))
+    assert np.array_equal(voxels_of(parse, data), bytes_of(volume, window.least, window.most))
     black, white = (data["least"] + step / 255 * (data["most"] - data["least"]) for step in data["ends"])
     assert (black, white) == pytest.approx((50.0, 400.0)) and data["centres"] is None
 
@@ -48,14 +46,14 @@ def test_noise_that_nothing_compresses_stays_within_the_budget(parse) -> None:
     noise = np.random.default_rng(1).integers(0, 256, (128, 128, 128)).astype(np.float32)
     data = data_of(parse, noise, Grid.cube(128, 10.0), Window.of(0.0, 255.0, noise, np.array([255.0])), None)
     assert 0.5 * MOST_TEXT < len(data["atlas"]) <= MOST_TEXT and MOST_TEXT == 2_000_000
-    assert np.abs(voxels_of(data).astype(float) - noise).max() <= 8  # 4 of 8 bits at least
+    assert np.abs(voxels_of(parse, data).astype(float) - noise).max() <= 8  # 4 of 8 bits at least
 
 
 def test_larger_volumes_are_means_over_blocks(parse) -> None:
     ramp = np.broadcast_to(np.arange(2.0 * MOST_EDGE, dtype=np.float32), (3, 4, 2 * MOST_EDGE))
     data = data_of(parse, ramp, Grid((3, 4, 2 * MOST_EDGE), (1.0, 1.0, 0.5)), Window.of(0.0, 255.0, ramp), None)
     assert data["counts"] == [MOST_EDGE, 4, 3] and "3 × 4 × 256 voxels (z, y, x), means over blocks" in data["words"]
-    assert np.array_equal(voxels_of(data)[0, 0], np.rint(np.arange(MOST_EDGE) * 2 + 0.5))
+    assert np.array_equal(voxels_of(parse, data)[0, 0], np.rint(np.arange(MOST_EDGE) * 2 + 0.5))
 
 
 def test_centres_are_places_in_the_box_and_densities_and_many_are_thinned(parse) -> None:

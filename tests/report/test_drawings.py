@@ -1,17 +1,15 @@
 """Charts of geometry, shutter and curves, for every kind of scan."""
 
 import re
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from parallel_kit import SIDE, laminography_scan, parallel_scan
 
-from phyradgs_cl.acquisition import MicroViews, PoseTable, Shutter, make_protocol
+from phyradgs_cl.acquisition import MicroViews, PoseTable, Scan, Shutter, make_protocol
 from phyradgs_cl.acquisition.altered.angles import middle_poses
 from phyradgs_cl.acquisition.motion import MODELS
 from phyradgs_cl.report import charts, scan_charts
@@ -19,13 +17,9 @@ from phyradgs_cl.report import charts, scan_charts
 pytestmark = pytest.mark.slow
 
 
-def drawn(draw: Callable[..., None], *arguments: object) -> Axes:
-    axes = Figure().add_subplot()
-    draw(axes, *arguments)
-    return axes
-
-
-def outlines(axes: Axes) -> list[np.ndarray]:
+def outlines(scan: Scan) -> list[np.ndarray]:
+    """The areas in the drawing of a shutter."""
+    scan_charts.draw_shutter(axes := Figure().add_subplot(), scan, None)
     return [patch.get_xy() for patch in axes.patches if isinstance(patch, Polygon)]
 
 
@@ -66,12 +60,12 @@ def test_a_chart_is_of_its_page(small_scan) -> None:
 
 
 def test_the_window_of_a_frame_is_a_parallelogram_from_opening_to_closing(kinds, small_scan) -> None:
-    (outline,) = outlines(drawn(scan_charts.draw_shutter, small_scan, None))
+    (outline,) = outlines(small_scan)
     lowest, highest = outline[outline[:, 1] == 0], outline[outline[:, 1] == outline[:, 1].max()]
     shutter = small_scan.shutter
     assert np.ptp(lowest[:, 0]) == pytest.approx(shutter.exposure_s) == pytest.approx(np.ptp(highest[:, 0]))
     assert highest[:, 0].max() - lowest[:, 0].min() == pytest.approx(shutter.span_s)
-    opened, lit = outlines(drawn(scan_charts.draw_shutter, kinds["pulsed"], None))
+    opened, lit = outlines(kinds["pulsed"])
     assert np.ptp(lit[:, 0]) < 0.2 * np.ptp(opened[:, 0])
 
 

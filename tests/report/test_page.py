@@ -5,13 +5,11 @@ import hashlib
 import json
 import re
 from dataclasses import replace
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 from refusals import assert_refused
-from skimage import io
 
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Shutter
 from phyradgs_cl.errors import OutputError
@@ -44,13 +42,6 @@ def page(page_text, parse):
 
 def no_runtime() -> None:
     raise AssertionError("no device is needed here")
-
-
-def decoded(source: str) -> np.ndarray:
-    """A picture of the page as pixels."""
-    kind, _, content = source.partition(",")
-    assert kind == "data:image/png;base64"
-    return io.imread(BytesIO(base64.b64decode(content, validate=True)))
 
 
 def test_a_page_is_whole_and_asks_nothing_of_the_world(page, page_text) -> None:
@@ -100,7 +91,7 @@ def test_pictures_decode_to_the_volume_slices(page, files, small_scan) -> None:
             window = data["windows"][layer]
             step = (window["most"] - window["least"]) / 255
             for k in (0, 5, 11):
-                image = decoded("data:image/png;base64," + plane["layers"][layer][k])
+                image = page.pixels("data:image/png;base64," + plane["layers"][layer][k])
                 expected = np.clip(volume.take(k, axis=axis)[::-1], window["least"], window["most"])
                 assert np.abs(window["least"] + step * image - expected).max() <= 0.501 * step
                 assert 10 ** -window["decimals"] <= step < 10 ** (1 - window["decimals"])
@@ -111,7 +102,7 @@ def test_without_a_script_the_middle_slices_have_the_stated_window(page, files) 
     stills = [image for image in page.all("img") if "slice of the volume" in image["alt"]]
     for axis, still in enumerate(stills):
         expected = 255 * np.clip(read_volume(files[1]).values.take(6, axis=axis)[::-1] / high, 0, 1)
-        assert np.abs(decoded(still["src"]) - expected).max() <= 1
+        assert np.abs(page.pixels(still["src"]) - expected).max() <= 1
     marks = [text for text in page.texts["b"] if text[0] in "+−"]
     assert marks == ["−x", "+x", "+y", "−y", "−x", "+x", "+z", "−z", "−y", "+y", "+z", "−z"]
     assert page.texts["span"].count("0.5 mm") == 3  # a bar of the largest round length below 0.3 of 2 mm
@@ -129,7 +120,7 @@ def test_the_shown_frames_are_close_to_the_measured_ones(rt, files, page) -> Non
     assert [view.frame for view in views] == [0, 2, 5] == spread_frames(8, 3)
     assert spread_frames(3, 16) == [0, 1, 2] and all(view.relative < 0.2 for view in views)
     images = [image for image in page.all("img") if image["alt"].startswith("frame ")]
-    assert len(images) == 9 and decoded(images[0]["src"]).shape == (16, 14)
+    assert len(images) == 9 and page.pixels(images[0]["src"]).shape == (16, 14)
     assert f"residual, RMS {views[0].rms:.4g}" in page.words
 
 
