@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 MOST = 2 * TIMES
 RUNS = {
     "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "5"],
-    "phyradgs": ["--method", "phyradgs", "--iterations", "30", "--gaussians", "30", "--set", "control.start_iteration=10"],
+    "phyradgs": ["--method", "phyradgs", "--iterations", "60", "--gaussians", "30", "--set", "control.start_iteration=20"],
 }
 
 

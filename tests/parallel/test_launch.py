@@ -1,5 +1,7 @@
 """How launchers are recognised, who takes which share, and what is said where the extra is missing."""
 
+import os
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -57,15 +59,21 @@ def test_other_commands_are_rank_0_s(monkeypatch) -> None:
     assert sys.stdout is None
 
 
+HIDDEN = """
+import sys
+sys.modules["mpi4py"] = None  # as where it is not installed
+from phyradgs_cl.__main__ import load_cli
+sys.exit(load_cli().run(sys.argv[1:]))
+"""
+
+
 @pytest.mark.parametrize("rank", [0, 1])
-def test_without_mpi4py_one_line_says_what_to_install(cli, monkeypatch, capfd, tmp_path, rank) -> None:
-    monkeypatch.setitem(sys.modules, "mpi4py", None)  # as where it is not installed
-    for name, value in {"PMI_RANK": str(rank), "PMI_SIZE": "2"}.items():
-        monkeypatch.setenv(name, value)
-    for stream in ("stdout", "stderr"):  # put back afterwards
-        monkeypatch.setattr(sys, stream, getattr(sys, stream))
-    assert cli.run(["reconstruct", "scan.h5", "-o", str(tmp_path / "v.h5")]) == 2
-    said = capfd.readouterr().err.splitlines()
+def test_without_mpi4py_one_line_says_what_to_install(tmp_path, rank) -> None:
+    environment = {**os.environ, "PMI_RANK": str(rank), "PMI_SIZE": "2"}
+    run = [sys.executable, "-c", HIDDEN, "reconstruct", "scan.h5", "-o", str(tmp_path / "v.h5")]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True)
+    assert done.returncode == 2
+    said = done.stderr.splitlines()
     assert len(said) == (rank == 0) and all('pip install "phyradgs-cl[mpi]"' in line for line in said)
 
 
