@@ -82,7 +82,7 @@ def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names
         size_mm = scan.measured("Voxel size", LENGTH, "um") * ratio
         if binned_mm is not None and abs(binned_mm - size_mm) <= _DISAGREE * size_mm:
             return binned_mm, binned_mm
-        if binned_mm is not None:  # which, as flexdata says, cannot be trusted in all logs
+        if binned_mm is not None:  # other readers do not trust it in all logs
             text = "%s Binned pixel size %.6g mm is not used, as Voxel size makes it %.6g mm; say %s to overrule both"
             _log.warning(text, scan.subject, binned_mm, size_mm, options.named("pixel_size_mm"))
         return size_mm, size_mm
