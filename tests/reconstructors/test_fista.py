@@ -174,6 +174,21 @@ def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) 
     assert [line["iteration"] for line in rest.record] == [line["iteration"] for line in whole.record] == list(range(1, 8))
 
 
+@pytest.mark.parametrize(("gains", "at"), [(True, 1), (True, 5), (False, 1), (False, 5)])
+def test_a_resumed_run_keeps_its_stages_on_a_device_with_another_room(rt, scan, gains, at, monkeypatch) -> None:
+    plan, name = plan_run("fista", {"iterations": 7}), "phyradgs_cl.reconstructors.voxels.fista._gains_from_subvoxels"
+
+    def stop(progress) -> None:
+        if progress.iteration >= at:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(name, lambda run, parts: gains)
+    whole, part = reconstruct(scan, plan, rt), reconstruct(scan, plan, rt, report=stop)
+    monkeypatch.setattr(name, lambda run, parts: not gains)
+    assert list(whole.facts["stages"]) != list(reconstruct(scan, plan, rt).facts["stages"])
+    np.testing.assert_array_equal(reconstruct(scan, plan, rt, resume=part.state).volume, whole.volume)
+
+
 def test_a_ridge_step_follows_every_fourth_map_unless_a_volume_is_too_thin_and_resumes_between_them(rt, scan) -> None:
     first, resumed, other = (kind_of("ridge").make(priors.PriorInputs(rt, scan.grid, 5)) for _ in range(3))
     pairs = zip(*(maps(prior, rt, scan.grid.shape, 4) for prior in (first, other.before)), strict=True)

@@ -34,7 +34,7 @@ from phyradgs_cl.reconstructors.result import Reconstruction
 from phyradgs_cl.reconstructors.voxels import priors
 from phyradgs_cl.reconstructors.voxels.priors import Denoiser, Prior, PriorWeight, frame_error
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, Iterations, IterativeOptions, MethodRun
-from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages, merge_subvoxels, repeated
+from phyradgs_cl.reconstructors.voxels.stages import STAGES, Stage, Stages, merge_subvoxels, repeated
 from phyradgs_cl.reconstructors.voxels.system import OrderedSubsets, System
 from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.runtime import Runtime
@@ -46,6 +46,7 @@ _FRAMES = 3  # number of arrays of all frames that a run holds in memory at one 
 _HELD = 9  # number of volumes that the prior ``dct`` keeps on the device, even if the run's arrays are on the host
 _COPIES = 2  # number of volumes, input and result, that a map of a prior needs on the device for a volume of the host
 # These values were chosen by measurement: docs/results/settings.md.
+_SUBVOXELS = "subvoxels"  # name of the stage on divided voxels
 _COARSE_SHARE = 6 / 13  # fraction of the iterations that are coarse: all before the voxels are divided
 _COARSE_PASSES = 2  # number of passes in a coarse iteration: they cost little, and scans with few views or photons need many
 _COARSE_SUBSETS = 1.6  # (number of subsets in a coarse pass)/(option ``subsets``)
@@ -272,7 +273,10 @@ def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
     """Returns the stages of a run: on the scan's own voxels and, if the options or the grid's size ask for it, on smaller
     voxels. A stage calls ``now`` for its run when it starts, because the object's motion may be known only then."""
     options = run.options
-    parts = options.subvoxels or (2 if _gains_from_subvoxels(run, 2) else 1)
+    # a resumed run keeps its stages, also on a device with another room
+    kept = None if run.resume is None else run.resume.get(STAGES)
+    gains = _gains_from_subvoxels(run, 2) if kept is None else _SUBVOXELS in kept
+    parts = options.subvoxels or (2 if gains else 1)
     first = round(_COARSE_SHARE * options.iterations) if parts > 1 else 0
     last = options.iterations - first
 
@@ -282,7 +286,7 @@ def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
     if parts == 1:
         return [stage("voxels", last, optimised=min(max(last - _CALM, 0), _MOST_OPTIMISED))]
     share = priors.subvoxel_share(options.prior, run.scan.grid.finer(parts).shape)
-    fine = replace(stage("subvoxels", last, parts=parts), merge=partial(merge_subvoxels, parts=parts, share=share))
+    fine = replace(stage(_SUBVOXELS, last, parts=parts), merge=partial(merge_subvoxels, parts=parts, share=share))
     return [stage("voxels", first, is_coarse=True), fine]
 
 

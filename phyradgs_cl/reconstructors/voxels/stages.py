@@ -15,7 +15,8 @@ from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.voxels.run import MethodRun, WithFacts
 
-_STAGE, _VOLUME = "stage", "volume_before"  # names of arrays in a state: the stage's number, and its first volume
+# Names of arrays in a state: the stage's number, its first volume, and the names of all the run's stages.
+_STAGE, _VOLUME, STAGES = "stage", "volume_before", "stages"
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,8 @@ class Stages:
 
     def state(self) -> dict[str, np.ndarray]:
         volume = {} if self._index == 0 or self.before is None else {_VOLUME: self.before}
-        return {**self.method.state(), **volume, _STAGE: np.array(self._index)}
+        names = np.array([stage.name for stage in self.stages])
+        return {**self.method.state(), **volume, _STAGE: np.array(self._index), STAGES: names}
 
     def restore(self, state: State) -> None:
         self.method.restore(state)
