@@ -31,7 +31,7 @@ from phyradgs_cl.detector.noise_level import noise_map
 from phyradgs_cl.fields import Deformation, Gaussians, Grid, States
 from phyradgs_cl.metrics.coverage import object_voxels
 from phyradgs_cl.reconstructors.checkpoint import State
-from phyradgs_cl.reconstructors.fdk.arc import distinct_views
+from phyradgs_cl.reconstructors.fdk.arc import distinct_views, view_arc
 from phyradgs_cl.reconstructors.fdk.travel import travels
 from phyradgs_cl.reconstructors.projected import FRAMES_AT_A_TIME, FramePair, frame_pairs, spread_frames
 from phyradgs_cl.reconstructors.result import DOUBT, Progress, ProgressReport, Reconstruction, through
@@ -39,7 +39,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import without_warnings
 
 # Methods whose error bars were checked against true volumes. The laws of ``fitted_law`` come from runs of the first 3.
-MEASURED = ("fista", "fista-tv", "fdk", "asd-pocs", "cgls", "os-sart", "sart", "sirt")
+MEASURED = ("fista", "fista-tv", "fdk", "phyradgs", "asd-pocs", "cgls", "os-sart", "sart", "sirt")
 RUNS = 3  # number of runs of the method: on the scan, and on two scans that are made from it
 PARTS = 2  # a voxel's side is divided into this many parts before projection, because projecting large voxels blurs
 FEWEST_FRAMES = 4  # analytic methods need this many frames: with one in each half, bars were 3 times too narrow
@@ -52,7 +52,10 @@ _KEPT = "doubt."  # prefix of the names of those arrays in a state that belong t
 _PARTS = {"gaussians": Gaussians, "deformation": Deformation, "states": States}
 _CHECKED_FRAMES = 16  # number of frames whose held-out pixels correct σ
 _AROUND = 9  # a pixel's squared error bar is averaged over a square of so many pixels a side: two runs give a rough bar
-_UNEXPLAINED = 2.0  # a residual above this many times the noise causes a warning; simulations had at most 1.2
+# A residual above this many times the noise causes a warning; simulations had at most 1.2. So do held-out pixels whose errors
+# are above this many times the error bars.
+_UNEXPLAINED = 2.0
+_UNSEEN_RAD = 0.05  # more of half a turn without views causes a warning of analytic methods: both halves lack the same views
 # A larger quotient noise/(line integrals) causes a warning: at 0.05 to 0.06, σ held 43 to 59 % of errors, not 68 %.
 _NOISY = 0.03
 _WIDEST = 4.0  # σ is multiplied by at most this factor: still larger errors of held-out pixels have other causes
@@ -193,7 +196,7 @@ class Doubter:
                     images = (pair.residual**2, rms**2, pair.measured**2, np.abs(pair.measured), pair.valid)
                     sums += [np.sum(one[pair.valid], dtype=np.float64) for one in images]
             if sums.all():
-                _warn_of(*(sums[:4] / sums[4]))
+                _warn_of(*(sums[:4] / sums[4]), "" if self.hidden is not None else "give --holdout 2, and ")
         return replace(self.scan, projections=self.rt.ranks.bcast(frames))
 
     def _pairs(self, result: Reconstruction, count: int) -> Iterator[FramePair]:
@@ -214,6 +217,11 @@ class Doubter:
             log.warning("all three runs have the same volume: there are no error bars; give the method more iterations")
             return first
         sigma = spread(first.volume, results[1].volume, results[2].volume, law)
+        if self.kind == "analytic":
+            unseen_rad = view_arc(azimuth_rad(middle_poses(self.scan))).unseen_rad()
+            if unseen_rad > _UNSEEN_RAD:
+                text = "error bars do not hold the errors that %.3g° of half a turn without views cause: take --method fista"
+                log.warning(text, np.rad2deg(unseen_rad))
         if self.scan.metal is not None:
             log.warning("error bars do not hold in metal, whose voxels come from a first volume")
         facts: dict[str, Any] = {"runs": RUNS, "share": _SHARE, "multiple_95": law.multiple_95}
@@ -240,9 +248,10 @@ class Doubter:
             wide = np.hypot(_NORMAL_95 * noise, law.multiple_95 * bar)
             inside.append([np.abs(error) <= np.hypot(noise, bar), np.abs(error) <= wide])
         wanted = widening(*np.concatenate(pixels, axis=1))
-        if wanted > _WIDEST:
-            text = "held-out pixels are %.3g times farther off than the error bars: run 'phyradgs check', and take a box "
-            log.warning(text + "around the whole object", wanted)
+        if wanted > _UNEXPLAINED:
+            text = "held-out pixels are %.3g times farther off than the error bars, which are widened by %.3g and hold the "
+            text += "cause in part: run 'phyradgs check', and take a box around the whole object"
+            log.warning(text, wanted, min(wanted, _WIDEST))
         within, within_95 = np.mean(np.concatenate(inside, axis=1), axis=1).tolist()
         return {"held_out_within": within, "held_out_within_95": within_95, "held_out_factor": min(wanted, _WIDEST)}
 
@@ -256,14 +265,14 @@ def widening(errors: Array, noise: Array, bars: Array) -> float:
     return float(np.sqrt(max(np.quantile(ratios, max(share, 0.0)), 1.0)))
 
 
-def _warn_of(residual_square: float, noise_square: float, square: float, mean: float) -> None:
-    """Warns if error bars may be too narrow. The arguments are means over the valid pixels of residual², noise², (line
+def _warn_of(residual_square: float, noise_square: float, square: float, mean: float, first_advice: str) -> None:
+    """Warns if error bars may be too narrow. The numbers are means over the valid pixels of residual², noise², (line
     integral)² and |line integral|."""
     unexplained, noisy = (residual_square / noise_square) ** 0.5, noise_square**0.5 / (square / mean)
     if unexplained > _UNEXPLAINED:
         text = "the volume leaves %.3g times the noise of the projections unexplained: error bars hold what causes that in "
-        text += "part, and may be too narrow; give --holdout 2, and run 'phyradgs check'"
-        log.warning(text, unexplained)
+        text += "part, and may be too narrow; %srun 'phyradgs check'"
+        log.warning(text, unexplained, first_advice)
     if noisy > _NOISY:
         text = "the noise is %.2g %% of the object's line integrals: error bars do not hold soft texture that it hides"
         log.warning(text, 100 * noisy)

@@ -75,7 +75,8 @@ def reconstruct(
         if plan.preprocessing.doubt:
             kind = "iterative" if hasattr(run.options, "iterations") else "analytic"
             if plan.method not in MEASURED:
-                text = "error bars were measured for %s: those of %s may be far too narrow; --holdout 2 widens them in part"
+                text = "error bars were measured for %s: those of %s may be far too narrow"
+                text += "" if plan.preprocessing.holdout else "; --holdout 2 widens them in part"
                 log.warning(text, ", ".join(MEASURED), plan.method)
             doubter = Doubter(rt, run.visible, run.scan, run.hidden, run.deformation, plan.seed, kind)
             result = doubter.run(once, report, state)

@@ -211,10 +211,20 @@ def test_gaussians_of_the_first_run_are_kept_by_a_state(rt, scan) -> None:
     assert result.doubt is not None
 
 
-def test_held_out_pixels_widen_bars_that_do_not_reach_them(rt, scan, monkeypatch) -> None:
+@pytest.mark.parametrize(("angles", "is_short"), [(np.linspace(0, 180, 24, False), False), (np.linspace(5, 150, 24), True)])
+def test_analytic_bars_on_less_than_half_a_turn_warn(rt, scan, angles, is_short, caplog) -> None:
+    frames = np.resize(scan.projections, (24, *scan.projections.shape[1:]))
+    part = static_scan(frames, scan.geometry, angles, grid=scan.grid)
+    reconstruct(part, "fdk", device=rt, report=False, doubt=True)
+    assert ("half a turn without views" in caplog.text) == is_short
+
+
+def test_held_out_pixels_widen_bars_that_do_not_reach_them(rt, scan, monkeypatch, caplog) -> None:
     right = reconstruct(scan, device=rt, doubt=True, holdout=10.0, **FEW)
+    assert "farther off" not in caplog.text
     monkeypatch.setattr(doubt, "fitted_law", lambda kind: Law(0.02, 0.02, 0.0, 0.0, 0.55, 3.0))
     narrow = reconstruct(scan, device=rt, doubt=True, holdout=10.0, **FEW)
+    assert "farther off" in caplog.text and "give --holdout" not in caplog.text
     assert 1 <= right.facts[DOUBT]["held_out_factor"] < narrow.facts[DOUBT]["held_out_factor"] <= 4
     assert right.facts[DOUBT]["held_out_within"] > 0.5
 
