@@ -52,8 +52,8 @@ _KEPT = "doubt."  # prefix of the names of those arrays in a state that belong t
 _PARTS = {"gaussians": Gaussians, "deformation": Deformation, "states": States}
 _CHECKED_FRAMES = 16  # number of frames whose held-out pixels correct σ
 _AROUND = 9  # a pixel's squared error bar is averaged over a square of so many pixels a side: two runs give a rough bar
-# A residual above this many times the noise causes a warning; simulations had at most 1.2. So do held-out pixels whose errors
-# are above this many times the error bars.
+# A residual above this many times the noise causes a warning; simulations had at most 1.2. So do errors of held-out pixels above
+# this many times the error bars.
 _UNEXPLAINED = 2.0
 _UNSEEN_RAD = 0.05  # more of half a turn without views causes a warning of analytic methods: both halves lack the same views
 # A larger quotient noise/(line integrals) causes a warning: at 0.05 to 0.06, σ held 43 to 59 % of errors, not 68 %.
@@ -196,7 +196,8 @@ class Doubter:
                     images = (pair.residual**2, rms**2, pair.measured**2, np.abs(pair.measured), pair.valid)
                     sums += [np.sum(one[pair.valid], dtype=np.float64) for one in images]
             if sums.all():
-                _warn_of(*(sums[:4] / sums[4]), "" if self.hidden is not None else "give --holdout 2, and ")
+                advice = "" if self.hidden is not None else "give --holdout 2, and "
+                _warn_of(sums[:4] / sums[4], advice)
         return replace(self.scan, projections=self.rt.ranks.bcast(frames))
 
     def _pairs(self, result: Reconstruction, count: int) -> Iterator[FramePair]:
@@ -265,9 +266,10 @@ def widening(errors: Array, noise: Array, bars: Array) -> float:
     return float(np.sqrt(max(np.quantile(ratios, max(share, 0.0)), 1.0)))
 
 
-def _warn_of(residual_square: float, noise_square: float, square: float, mean: float, first_advice: str) -> None:
-    """Warns if error bars may be too narrow. The numbers are means over the valid pixels of residual², noise², (line
-    integral)² and |line integral|."""
+def _warn_of(means: Array, first_advice: str) -> None:
+    """Warns if error bars may be too narrow. means: over the valid pixels, of residual², noise², (line integral)² and |line
+    integral|. first_advice: comes before the usual advice."""
+    residual_square, noise_square, square, mean = means.tolist()
     unexplained, noisy = (residual_square / noise_square) ** 0.5, noise_square**0.5 / (square / mean)
     if unexplained > _UNEXPLAINED:
         text = "the volume leaves %.3g times the noise of the projections unexplained: error bars hold what causes that in "
