@@ -52,8 +52,8 @@ _KEPT = "doubt."  # prefix of the names of those arrays in a state that belong t
 _PARTS = {"gaussians": Gaussians, "deformation": Deformation, "states": States}
 _CHECKED_FRAMES = 16  # number of frames whose held-out pixels correct σ
 _AROUND = 9  # a pixel's squared error bar is averaged over a square of so many pixels a side: two runs give a rough bar
-# A residual above this many times the noise causes a warning; simulations had at most 1.2. So do errors of held-out pixels above
-# this many times the error bars.
+# A residual above this many times the noise causes a warning; simulations had at most 1.2. So do errors of held-out pixels
+# above this many times the error bars.
 _UNEXPLAINED = 2.0
 _UNSEEN_RAD = 0.05  # more of half a turn without views causes a warning of analytic methods: both halves lack the same views
 # A larger quotient noise/(line integrals) causes a warning: at 0.05 to 0.06, σ held 43 to 59 % of errors, not 68 %.
