@@ -38,7 +38,8 @@ def robust_deviation(values: np.ndarray) -> float:
 
 
 def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) -> float:
-    """Returns the standard deviation of a pixel's noise behind the object, dimensionless. Without usable pixels it is 0.
+    """Returns the standard deviation of a pixel's noise behind the object, dimensionless. Without usable pixels it is 0, and
+    where most pixels have no noise.
 
     It comes from the median of |second differences| along rows, where line integrals (F, v, u) are above 0. An object is
     smooth compared with white noise, and a median ignores edges (Donoho and Johnstone, Biometrika 81 (1994) 425). Detail as
@@ -46,13 +47,13 @@ def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | 
     if line_integrals.shape[-1] < 3:
         return 0.0
     left, middle, right = _threes(line_integrals, -1)
-    usable = middle > 0
-    if valid is not None:
-        usable = np.logical_and.reduce([usable, *_threes(valid, -1)])
+    usable = np.ones(middle.shape, bool) if valid is None else np.logical_and.reduce(_threes(valid, -1))
+    if not usable.any():
+        return 0.0
+    # Zeros may be clipped noise. Pixels from the median on count too: those above 0 may be edges of small bodies alone.
+    usable &= (middle > 0) | (middle >= np.median(middle[usable], overwrite_input=True))
     pixels = np.flatnonzero(usable)
     pixels = pixels[:: max(1, pixels.size // _LARGEST_SAMPLE)]
-    if pixels.size == 0:
-        return 0.0
     second = middle.ravel()[pixels] - 0.5 * (left.ravel()[pixels] + right.ravel()[pixels])
     return float(np.median(np.abs(second))) / (_MEDIAN_OF_NORMAL * _FILTER_NORM)
 
@@ -102,11 +103,12 @@ def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) 
     """Returns the root mean square of the noise behind the object, dimensionless, from some frames. line_integrals, valid:
     (F, v, u).
 
-    Air is left out: its noise is lower, and in some files clipped at 0."""
+    Air is left out: its noise is lower, and in some files clipped at 0. The smaller of two estimates is taken, for edges of
+    small bodies raise the one without air."""
     some = slice(None, None, max(1, len(line_integrals) // _FRAMES))
     frames, usable = line_integrals[some], valid[some]
     behind = usable & (frames > _BEHIND * noise_level(frames, usable))
-    return noise_rms(frames, behind, behind)
+    return min(noise_rms(frames, behind, valid) for valid in (behind, usable))
 
 
 def _threes(frames: NDArray[Any], axis: int) -> tuple[NDArray[Any], ...]:

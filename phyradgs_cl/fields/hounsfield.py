@@ -107,11 +107,8 @@ def fitted(
 
     Without a box of air, the lowest peak of the histogram is air. Without a box of water, the largest other peak is water.
     insert_hu: the HU of the material in the box ``water``, if it is not water. Raises InputError for fewer than 100 voxels,
-    air that is not below water, a histogram without two peaks that can be air and water, and values below −10, which are
-    no attenuation."""
+    air that is not below water, and a histogram without two peaks that can be air and water."""
     checks.within("--insert-hu", insert_hu, -900, 30_000)
-    if values.min() < -10:  # attenuation in 1/mm is never so negative
-        raise InputError("--hu", f"values from {values.min():g}, as of Hounsfield units", "attenuation in 1/mm")
     of_air = None if air is None else _inside("--air-mm", values, grid, air)
     of_water = None if water is None else _inside("--water-mm", values, grid, water)
     if of_air is None or of_water is None:

@@ -304,13 +304,15 @@ def scan_on_stage(
     stage: RotaryStage, options: ImportOptions, path: Path, title: str, frames: np.ndarray, sides: tuple[str, str],
     angle_rad: np.ndarray, places: np.ndarray, names: dict[str, str], said: str, *, stored: StoredTiming | None = None,
     flats: np.ndarray | None = None, darks: np.ndarray | None = None, flat_value: float | None = None,
+    light: np.ndarray | None = None,
 ) -> Scan:
     """Returns the scan of a sample on a stage. frames (F, v, u) are counts, which the file ``path`` describes. Options
     replace values of the file.
 
     - sides: where row 0 and column 0 are, such as ("top", "left"). angle_rad (F,): gantry angles. places (F,): the frames'
       numbers from 0 on. names, said: see ``assemble_scan``. stored: the file's timing.
-    - flats, darks (n, v, u): None where the scanner has applied them. flat_value: counts of air that the file states."""
+    - flats, darks (n, v, u): None where the scanner has applied them. flat_value: counts of air that the file states.
+    - light (F,): that of counts, in units of the flats'; None: as bright."""
     timing = make_timing(str(path), places, options, stored)
     trajectory, geometry = stage.turned(angle_rad, timing, str(path))
     images = (None if one is None else oriented(one, options, *sides) for one in (frames, flats, darks))
@@ -319,6 +321,8 @@ def scan_on_stage(
     integrals = line_integrals(
         str(path), frames, with_air, flats=flats, darks=darks, convention="counts", is_corrected=darks is None
     )
+    if light is not None and options.quantity in (None, "counts"):
+        integrals = integrals.in_light(light)
     parts = integrals, trajectory, geometry, timing, options, path
     return assemble_scan(*parts, title=title, names=names, said=said)
 

@@ -6,7 +6,7 @@ where nothing states the times."""
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -150,6 +150,10 @@ class LineIntegrals:
     mask: Mask
     saturation: Saturation | None = None
     applied: Mapping[str, object] = field(default_factory=dict)
+
+    def in_light(self, light: np.ndarray) -> "LineIntegrals":
+        """Returns the line integrals of projections in ``light`` (P,) times the light of the flats."""
+        return replace(self, values=self.values + np.float32(np.log(light))[:, None, None])
 
 
 def line_integrals(

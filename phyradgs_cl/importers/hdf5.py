@@ -239,8 +239,8 @@ class Stacks:
         integrals = line_integrals(
             subject, frames, options, flats=flats, darks=darks, convention=convention, flats_at=self.flats_at
         )
-        if self.light is not None and (brighter := np.log(self.light)).any():
-            integrals = replace(integrals, values=integrals.values + np.float32(brighter)[:, None, None])
+        if self.light is not None and (self.light != 1).any():
+            integrals = integrals.in_light(self.light)
         return integrals if bad is None else replace(integrals, mask=united(bad != 0, integrals.mask))
 
 

@@ -47,14 +47,14 @@ def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Vol
 
 
 def in_per_mm(subject: str, volume: Volume, mu_water_per_mm: float | None = None) -> Volume:
-    """Returns a volume in 1/mm, with the scale of the Hounsfield units that it had, if any. A file's note may say that
-    values are in 1/mm, or in Hounsfield units, with a scale; or ``mu_water_per_mm`` states it. Without a note, it
+    """Returns a volume in 1/mm, with the scale of the Hounsfield units that it had, if any. A file may state that values
+    are in 1/mm, or in Hounsfield units, with a scale; or ``mu_water_per_mm`` states it. Where the file states nothing, it
     converts volumes with values beyond ±10 1/mm. Raises InputError about ``subject`` for noted Hounsfield units without
     scale."""
     stated = None if mu_water_per_mm is None else Hounsfield(mu_water_per_mm)
     note = str(volume.provenance.get(VALUES, ""))
     is_hu, scale = of_note(note)
-    if scale is None and (is_hu or (PER_MM not in note and float(np.abs(volume.values).max()) > _USUAL_PER_MM)):
+    if scale is None and (is_hu or (not _is_per_mm(volume) and float(np.abs(volume.values).max()) > _USUAL_PER_MM)):
         scale = stated
     if scale is not None:
         facts = {**volume.provenance, **scale.facts(), VALUES: FROM_HU}
@@ -77,10 +77,14 @@ def words_of_hu(volumes: Mapping[Path, Volume], mu_water_per_mm: float | None = 
 
 def attenuation_of(subject: str, volume: Volume) -> Volume:
     """Returns ``volume`` unchanged. Raises InputError about ``subject`` if its values cannot be in 1/mm, because they lie
-    below −10 or above 1000, as Hounsfield units do, and no note says that they are in 1/mm."""
+    below −10 or above 1000, as Hounsfield units do, and the file does not state that they are in 1/mm."""
     lowest, highest = float(volume.values.min()), float(volume.values.max())
-    is_noted = PER_MM in str(volume.provenance.get(VALUES, ""))
-    if not is_noted and (lowest < _LOWEST_PER_MM or highest > _HIGHEST_PER_MM):
+    if not _is_per_mm(volume) and (lowest < _LOWEST_PER_MM or highest > _HIGHEST_PER_MM):
         found = f"values from {lowest:g} to {highest:g}, as of Hounsfield units"
         raise InputError(subject, found, "attenuation in 1/mm", "say --mu-water-per-mm, near 0.02, to convert them")
     return volume
+
+
+def _is_per_mm(volume: Volume) -> bool:
+    """Returns whether the file states that its values are in 1/mm, or in a unit that was converted to it."""
+    return volume.is_stated or PER_MM in str(volume.provenance.get(VALUES, ""))

@@ -35,7 +35,8 @@ log = logging.getLogger(__name__)
 class Volume:
     """Values (nz, ny, nx) float32 in 1/mm and their grid, None for a bare array. provenance: how they were made, in the
     types of ``tables.PROVENANCE``. gaussians: float32, in mm and 1/mm. metrics: by name. deformation: the object's motion
-    from this volume. states: the object at several times, whose mean is this volume. doubt: σ (nz, ny, nx) in 1/mm."""
+    from this volume. states: the object at several times, whose mean is this volume. doubt: σ (nz, ny, nx) in 1/mm.
+    is_stated: whether the file states the values' unit, so that values of any size are in 1/mm."""
 
     values: np.ndarray
     grid: Grid | None
@@ -45,6 +46,7 @@ class Volume:
     deformation: Deformation | None = None
     states: States | None = None
     doubt: np.ndarray | None = None
+    is_stated: bool = False
 
     def at(self, time_s: float) -> np.ndarray:
         """Returns the values (nz, ny, nx) in 1/mm at a time in s; ``values`` for an object without states and motion."""
@@ -67,7 +69,11 @@ class Volume:
         return of_facts(self.provenance)
 
     def hounsfield(self, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0) -> "Volume":
-        """Returns the volume, still in 1/mm, with a scale of Hounsfield units. See ``hounsfield.fitted``."""
+        """Returns the volume, still in 1/mm, with a scale of Hounsfield units. See ``hounsfield.fitted``. Raises InputError
+        for values below −10, which are no attenuation, unless the file states their unit."""
+        if not self.is_stated and self.values.min() < -10:
+            found = f"values from {self.values.min():g}, as of Hounsfield units"
+            raise InputError("--hu", found, "attenuation in 1/mm")
         scale = fitted(self.values, self.required_grid, air, water, insert_hu)
         return replace(self, provenance={**self.provenance, **scale.facts()})
 
@@ -143,7 +149,8 @@ def read_volume(path: str | Path) -> Volume:
         if (sigma := source.optional(_DOUBT)) is not None:
             checks.shape(source.name(_DOUBT), sigma, grid.shape)
         doubt = None if sigma is None else h5.read_attenuation(source, _DOUBT, sigma)
-        return Volume(values, grid, provenance, gaussians, metrics, deformation, states, doubt)
+        is_stated = not {"units", "unit"}.isdisjoint(dataset.attrs)
+        return Volume(values, grid, provenance, gaussians, metrics, deformation, states, doubt, is_stated)
 
 
 def read_state(path: str | Path) -> dict[str, np.ndarray] | None:

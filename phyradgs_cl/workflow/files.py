@@ -97,7 +97,7 @@ def load_reference(path: Path, mu_water_per_mm: float | None = None) -> tuple[Vo
         scan = load_scan(path)
         if scan.reference is None:
             raise InputError(f"{path}:/entry/phyradgs/reference/volume", "no reference", "a scan with a known truth")
-        return Volume(scan.reference, scan.grid), scan.moving_truth
+        return Volume(scan.reference, scan.grid, is_stated=True), scan.moving_truth
     return load_result(path, mu_water_per_mm), None
 
 

@@ -51,6 +51,8 @@ def test_evaluate_converts_a_reference_in_hounsfield_units_or_refuses_it(told, r
     truth, water_per_mm = values - 0.01, 0.019
     write_volume(tmp_path / "truth.h5", truth, grid, {})
     write_volume(tmp_path / "hu.h5", 1000 * (truth / water_per_mm - 1), grid, {})
+    with h5py.File(tmp_path / "hu.h5", "r+") as file:
+        del file["entry/reconstruction/volume"].attrs["units"]  # a file that states a unit is taken at its word
     words = ["evaluate", volume, "--json", "--reference"]
     plain = told(*words, tmp_path / "truth.h5")
     converted = told(*words, tmp_path / "hu.h5", "--mu-water-per-mm", water_per_mm)

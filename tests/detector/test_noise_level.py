@@ -33,6 +33,37 @@ def test_white_noise_is_found_behind_the_object_in_pixels_that_are_valid() -> No
     assert noise_level(some, valid) == pytest.approx(0.02, rel=0.05)
 
 
+BODIES = {  # radii (v, u) in pixels, and how many of them a frame has
+    "bead": ((2, 2), 1), "speck": ((0.6, 0.6), 1), "beads": ((3, 3), 4), "needle": ((20, 0.7), 1), "ball": ((20, 20), 1),
+    "plate": ((3, 40), 1), "full": ((200, 200), 1),
+}  # fmt: skip
+
+
+def body_frames(name: str) -> np.ndarray:
+    """Line integrals (8, 64, 96) of ellipsoids, up to 1 each, at other places in each frame; 0 in air."""
+    (radii, count), rng = BODIES[name], np.random.default_rng(3)
+    v, u = np.mgrid[:64, :96]
+    frames = np.zeros((8, 64, 96))
+    for frame in frames:
+        for centre in rng.uniform(0.35, 0.65, (count, 2)) * (64, 96):
+            far = ((v - centre[0]) / radii[0]) ** 2 + ((u - centre[1]) / radii[1]) ** 2
+            frame += np.sqrt(np.maximum(1 - far, 0))
+    return frames
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_edges_of_bodies_of_every_size_are_no_noise(name) -> None:
+    """Air is 0 without noise, clipped at 0, or below 0 where the beam has become brighter."""
+    p, every = body_frames(name), np.ones((8, 64, 96), bool)
+    assert noise_level(p.astype(np.float32)) < 5e-4 and noise_behind(p.astype(np.float32), every) < 5e-3
+    for photons in (1e3, 1e4, 1e6):
+        noisy = -np.log(np.random.default_rng(1).poisson(photons * np.exp(-p)) / photons)
+        true = float(np.std(noisy - p))
+        for air, least in ((0.0, 0.85), (-0.2, 0.85)):
+            assert least * true < noise_level((noisy + air).astype(np.float32)) < 1.4 * true + 4e-4
+        assert 0.4 * true < noise_level(np.maximum(noisy, 0).astype(np.float32)) < 1.4 * true + 4e-4
+
+
 def test_the_noise_behind_the_object_does_not_depend_on_the_air() -> None:
     """Half of air's noise is gone in files that are clipped at 0, and most of their pixels are air."""
     u = np.linspace(-3, 3, 192)

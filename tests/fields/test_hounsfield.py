@@ -7,6 +7,7 @@ from refusals import assert_refused
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, Hounsfield
 from phyradgs_cl.fields.hounsfield import fitted, of_facts, of_note
+from phyradgs_cl.io import Volume
 
 GRID = Grid((24, 32, 40), (2.0, 1.5, 1.0), (7.0, -3.0, 30.0))
 AIR, WATER, INSERT = 0.0012, 0.0206, 0.0412  # of a scan with some scatter; the insert has about 1000 HU
@@ -58,7 +59,7 @@ def test_what_is_no_scale_is_refused() -> None:
         "expected air below water": lambda: fitted(values, GRID, WATER_BOX, AIR_BOX),
         "air near 0; state a box": lambda: fitted(no_air, GRID),
         "[01] peaks? in the volume": lambda: fitted(values[:, :, :4], Grid((24, 32, 4), (1.0, 1.0, 1.0))),
-        "as of Hounsfield units": lambda: fitted(Hounsfield(WATER).of(values), GRID),
+        "as of Hounsfield units": lambda: Volume(Hounsfield(WATER).of(values), GRID).hounsfield(),
         "shape \\(6\\)": lambda: fitted(values, GRID, (1.0, 2.0, 3.0)),
         "Z0 below Z1": lambda: fitted(values, GRID, AIR_BOX[::-1], WATER_BOX),
         "--insert-hu": lambda: fitted(values, GRID, AIR_BOX, WATER_BOX, -1000),

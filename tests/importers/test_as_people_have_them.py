@@ -349,7 +349,7 @@ def test_xradia_s_scans_that_stopped_early_and_have_several_references(tmp_path,
     stopped = {"ImageInfo/ImagesTaken": np.int32(4), "ImageData1/Image6": None}
     scan = import_scan(lab.write_zeiss(tmp_path / "a", truth, **streams, **stopped))
     np.testing.assert_array_equal(scan.projections, lab.line_integrals_of(lab.counts16(truth))[:4])
-    assert "stopped early: 4 of 6 images" in caplog.text and "median of 3" in scan.provenance["taken"]
+    assert "a.txrm: the scan stopped early: 4 of 6 images" in caplog.text and "median of 3" in scan.provenance["taken"]
     path = lab.write_zeiss(tmp_path / "b", truth, **{"ImageData1/Image6": None})
     assert import_scan(path, ImportOptions(frames="found")).frames == 5
 

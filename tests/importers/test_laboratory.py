@@ -165,6 +165,29 @@ def test_flexray_s_voxel_size_comes_before_another_pixel_size(tmp_path, make_tru
     assert import_scan(path, ImportOptions(pixel_size_mm=1.5)).geometry.pixel_size_mm == (1.5, 1.5)
 
 
+def test_zeiss_s_images_and_references_of_several_exposures(tmp_path, make_truth, caplog) -> None:
+    """Those of ReferenceData come first. Exposures may differ between references and between images."""
+    truth, flat_s, frame_s = make_truth(geometry=CENTRED), np.float32([0.25, 2, 0.5]), np.float32([1, 0.5, 1, 2, 0.5, 1])
+    white = np.full(CENTRED.detector_shape, lab.WHITE, np.float32)
+    several = {f"MultiReferenceData/Image{i + 1}": white * seconds for i, seconds in enumerate(flat_s)}
+    several["MultiReferenceData/ExpTime"] = flat_s
+    one = {"ReferenceData/Image": white * 4, "ReferenceData/ExpTime": np.float32(4)}
+    counts = lab.counts16(truth).astype(np.float32) * frame_s[:, None, None]
+    longer = {f"ImageData1/Image{i + 1}": image for i, image in enumerate(counts)} | {"ImageInfo/DataType": np.int32(10)}
+    longer["ImageInfo/ExpTimes"] = np.float32([*frame_s, 0])  # there is room for one image more
+    every_second = {"ImageInfo/ExpTimes": np.float32([1])}
+    none = {"ReferenceData/Image": None}
+    dimmer = {name: values * 0.9 for name, values in several.items() if "Image" in name}
+    for i, streams in enumerate((none | several | every_second, one | several | dimmer | longer, none | several | longer)):
+        caplog.clear()
+        scan = import_scan(lab.write_zeiss(tmp_path / f"{i}", truth, **streams))
+        np.testing.assert_allclose(scan.projections, truth.scan.projections, atol=2e-4)
+        assert ("ExpTimes: 0.5 to 2 s: each image is divided by its own" in caplog.text) == (i > 0)
+    integrals = {name: values / 10000 if name.startswith("ImageData") else values for name, values in longer.items()}
+    scan = import_scan(lab.write_zeiss(tmp_path / "p", truth, **integrals), ImportOptions(quantity="attenuation"))
+    np.testing.assert_allclose(scan.projections, counts / 10000, rtol=1e-6)
+
+
 def test_zeiss_s_shifts_move_the_panel(tmp_path, make_truth, caplog) -> None:
     """An image that is to be moved to the right by a column was taken by a panel a column further to the left."""
     geometry = ConeGeometry(512.0, 1024.0, (10, 14), (2.5, 2.5))
@@ -185,8 +208,10 @@ def test_zeiss_s_shifts_move_the_panel(tmp_path, make_truth, caplog) -> None:
     fly = import_scan(path, ImportOptions(flat_value=lab.WHITE, fps=0.8))
     assert fly.shutter.exposure_s == 0.5 and fly.is_fly
     assert "no Alignment/X-Shifts (0), no ImageInfo/XrayGeometry (a cone)" in caplog.text
-    flat = lab.write_zeiss(tmp_path / "c", truth, **{"ImageInfo/XrayGeometry": np.int32(0)})
+    assert "parallel" not in caplog.text
+    flat = lab.write_zeiss(tmp_path / "c", truth, **{"ImageInfo/XrayGeometry": np.int32(2)})
     assert import_scan(flat).geometry.pixel_size_mm == (1.25, 1.25)
+    assert "ImageInfo/XrayGeometry is 2: a parallel beam, so ImageInfo/StoRADistance and" in caplog.text
 
 
 def test_a_zeiss_file_with_images_in_two_folders_and_in_float(tmp_path, make_truth) -> None:

@@ -1,6 +1,7 @@
 """Volume files: what is written comes back, viewers find their axes, damage is named; and bare arrays."""
 
 import hashlib
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -12,6 +13,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid, States
 from phyradgs_cl.importers import load_attenuation, load_volume
 from phyradgs_cl.io import read_states, read_volume, sha256_of, volume_summary, write_volume
+from phyradgs_cl.io.attenuation import attenuation_of
 
 GRID = Grid((2, 3, 4), (1.5, 1.25, 1.0), (0.1, -0.2, 0.3))
 PROVENANCE = {"method": "fdk", "seed": 7, "options": {"filter": "ram-lak", "M": [1, 2]}, "loss": float("inf")}
@@ -129,6 +131,28 @@ def test_what_does_not_attenuate_cannot_be_scanned(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"v.h5: found values from .*; expected attenuation: 0 in air"):
             load_attenuation(path)
         assert load_volume(path).values.min() == level
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("1/mm", 1.0), ("1/µm", 1e3), ("cm^-1", 0.1)])
+def test_a_file_that_states_its_unit_is_taken_at_its_word(tmp_path: Path, unit: str, factor: float) -> None:
+    """In nano-CT attenuation is 100 to 250 per mm and more, and noise is as high. Without the unit this could be HU."""
+    values = np.random.default_rng(0).normal(0, 60, (12, 12, 12)).astype(np.float32)
+    values[:6] += 600.0
+    path = tmp_path / "v.h5"
+    write_volume(path, values / factor, Grid(values.shape, (1e-4,) * 3), {})
+    with h5py.File(path, "r+") as file:
+        file["entry/reconstruction/volume"].attrs["units"] = unit
+    for asked in (None, 0.02):
+        volume = attenuation_of("v.h5", load_volume(path, asked))
+        np.testing.assert_allclose(volume.values, values, rtol=1e-6)
+    scale = volume.hounsfield().scale
+    assert scale is not None and scale.water_per_mm == pytest.approx(600, rel=0.05)
+    with h5py.File(path, "r+") as file:
+        del file["entry/reconstruction/volume"].attrs["units"]
+        file["entry/reconstruction/volume"][...] = values
+    for refused in (partial(attenuation_of, "v.h5", load_volume(path)), load_volume(path).hounsfield):
+        with pytest.raises(InputError, match="as of Hounsfield units"):
+            refused()
 
 
 def test_hounsfield_units_are_refused_or_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -31,12 +31,12 @@ _log = logging.getLogger(__name__)
 _INFO, _ONE, _SEVERAL = "ImageInfo", "ReferenceData", "MultiReferenceData"
 _COUNTS = ("NoOfImages", "ImageHeight", "ImageWidth")
 _REAL = ("PixelSize", "Angles", "StoRADistance", "DtoRADistance", "ExpTimes")
-_EXPOSURES = (f"{_ONE}/ExpTime", f"{_INFO}/ExpTimes")
+_EXPOSURES = f"{_INFO}/ExpTimes"
 _STREAMS = {
     **{f"{_INFO}/{name}": "<i4" for name in (*_COUNTS, "DataType", "XrayGeometry", "ImagesTaken")},
     **{f"{_INFO}/{name}": "<f4" for name in _REAL},
     "Alignment/X-Shifts": "<f4", "Alignment/Y-Shifts": "<f4", "ReconSettings/CenterShift": "<f4",
-    **dict.fromkeys(_EXPOSURES, "<f4"), f"{_ONE}/DataType": "<i4", f"{_SEVERAL}/DataType": "<i4",
+    **{f"{kind}/{name}": dtype for kind in (_ONE, _SEVERAL) for name, dtype in (("DataType", "<i4"), ("ExpTime", "<f4"))},
 }  # fmt: skip
 _TYPES = {5: "<u2", 10: "<f4"}  # DataType's codes, as NumPy types
 _PER_FOLDER = 100  # images in each of the container's folders ImageData1, ImageData2, …
@@ -82,21 +82,19 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         taken = int(scan.first_of(f"{_INFO}/ImagesTaken", 0)) if scan.has(f"{_INFO}/ImagesTaken") else count
         taken = min(taken, count) or count  # of the planned images; all if the file states no number or 0
         if taken < count:
-            _log.warning("%s: the scan stopped early: %d of %d images were taken", scan.subject, taken, count)
+            _log.warning("%s: the scan stopped early: %d of %d images were taken", path, taken, count)
         names, panel = [f"ImageData{i // _PER_FOLDER + 1}/Image{i + 1}" for i in range(taken)], (rows, columns)
         there = [i for i, name in enumerate(names) if options.frames != "found" or ole.exists(name)]
         at = np.array(there or [0])  # without any image, reading the first one raises the error
         frames = read_images(ole, path, [names[i] for i in at], _type(scan, f"{_INFO}/DataType"), panel)
-        whites = sorted("/".join(one) for one in ole.listdir() if one[0] in (_ONE, _SEVERAL) and one[1].startswith("Image"))
-        whites = [name for name in whites if re.fullmatch(r"[^/]*/Image\d*", name)]
-        kind = f"{whites[0].split('/')[0]}/DataType" if whites else ""
-        flats = read_images(ole, path, whites, _type(scan, kind, 10), panel) if whites else None
-        if flats is not None and kind.startswith(_ONE) and all(map(scan.has, _EXPOSURES)):
-            flat_s, frame_s = (scan.first_of(name, 0) for name in _EXPOSURES)
-            if min(flat_s, frame_s) > 0 and abs(flat_s / frame_s - 1) > _STEADY:
-                text = "%s is %g s, that of the images %g s: the reference is divided by their ratio, as in txrm2tiff"
-                _log.warning(text, scan.name(_EXPOSURES[0]), flat_s, frame_s)
-                flats = np.float32(flats) * np.float32(frame_s / flat_s)
+        exposures_s = _exposures_s(scan, _EXPOSURES, at)
+        usual_s = float(np.median(exposures_s))
+        flats = _references(ole, path, scan, panel, usual_s)
+    light = None
+    if np.ptp(exposures_s) > _STEADY * usual_s:
+        light = exposures_s / usual_s
+        text = "%s: %g to %g s: each image is divided by its own"
+        _log.warning(text, scan.name(_EXPOSURES), exposures_s.min(), exposures_s.max())
     said = f"frames: {len(at)} of {count} images"
     angles = f"{_INFO}/Angles"
     angle_rad = options.gantry_sign("sample") * options.angle_rad(
@@ -104,14 +102,38 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     )
     in_file = {
         "source_to_axis_mm": scan.name(f"{_INFO}/StoRADistance"), "angles": scan.name(angles),
-        "source_to_detector_mm": scan.name(f"{_INFO}/DtoRADistance"), "exposure_s": scan.name(f"{_INFO}/ExpTimes"),
+        "source_to_detector_mm": scan.name(f"{_INFO}/DtoRADistance"), "exposure_s": scan.name(_EXPOSURES),
         "pixel_size_mm": scan.name(f"{_INFO}/PixelSize"),
     }  # fmt: skip
     stored = assemble.StoredTiming()
-    if scan.has(f"{_INFO}/ExpTimes") and options.exposure_s is None:
-        stored = assemble.StoredTiming(exposure_s=scan.first_of(f"{_INFO}/ExpTimes", 0) or None)
+    if scan.has(_EXPOSURES) and options.exposure_s is None:
+        stored = assemble.StoredTiming(exposure_s=scan.first_of(_EXPOSURES, 0) or None)
     turned, stage = (frames, ("bottom", "left"), angle_rad, at, in_file, said), _stage(scan, at, panel, options)
-    return scan_on_stage(stage, options, path, path.stem, *turned, stored=stored, flats=flats)
+    return scan_on_stage(stage, options, path, path.stem, *turned, stored=stored, flats=flats, light=light)
+
+
+def _references(ole: Any, path: Path, scan: Streams, panel: tuple[int, int], usual_s: float) -> np.ndarray | None:
+    """Returns the reference images (n, v, u) with the light of an exposure of ``usual_s``; as stored if the file does not
+    state their own or ``usual_s`` is 0. As in xrmreader, ReferenceData comes first. None: the file has no reference."""
+    stored = ["/".join(one) for one in ole.listdir()]
+    for kind in (_ONE, _SEVERAL):
+        if names := [name for name in stored if re.fullmatch(rf"{kind}/Image\d*", name)]:
+            flats = read_images(ole, path, names, _type(scan, f"{kind}/DataType", 10), panel)
+            flat_s = _exposures_s(scan, f"{kind}/ExpTime", np.arange(len(names)))
+            if flat_s.min() > 0 and usual_s > 0 and np.abs(flat_s / usual_s - 1).max() > _STEADY:
+                text = "%s is %g s, that of the images %g s: the reference is divided by their ratio, as in txrm2tiff"
+                _log.warning(text, scan.name(f"{kind}/ExpTime"), np.median(flat_s), usual_s)
+                flats = flats * np.float32(usual_s / flat_s)[:, None, None]
+            return flats
+    return None
+
+
+def _exposures_s(scan: Streams, name: str, at: np.ndarray) -> np.ndarray:
+    """Returns the exposures of the images with numbers ``at`` (F,): the first for all if the stream has fewer numbers, 0 for
+    all if one is not above 0 or the stream is missing."""
+    values = scan.numbers(name) if scan.has(name) else np.zeros(0)
+    some = values[at] if len(values) > at[-1] else np.resize(values[:1], len(at))
+    return some if np.all(some > 0) else np.zeros(len(at))
 
 
 def _type(scan: Streams, name: str, default: float | None = None) -> str:
@@ -125,21 +147,23 @@ def _type(scan: Streams, name: str, default: float | None = None) -> str:
 
 def _stage(scan: Streams, at: np.ndarray, panel: tuple[int, int], options: ImportOptions) -> RotaryStage:
     """Returns a stage whose panel is shifted in each image by the image's alignment shift. at (F,): the images' numbers."""
-    is_cone = not scan.has(f"{_INFO}/XrayGeometry") or scan.first_of(f"{_INFO}/XrayGeometry") == 1
+    beam, distances = f"{_INFO}/XrayGeometry", (f"{_INFO}/StoRADistance", f"{_INFO}/DtoRADistance")
+    is_cone = not scan.has(beam) or scan.first_of(beam) == 1
+    if not is_cone and all(map(scan.has, distances)):
+        text = "%s is %g: a parallel beam, so %s and %s are not used; of a cone beam it is 1"
+        _log.warning(text, scan.name(beam), scan.first_of(beam), *distances)
 
     def pixel_mm(magnification: float = 1.0) -> tuple[float, float]:
         return (scan.first_of(f"{_INFO}/PixelSize", 1e-6, 1e6) / 1000 * magnification,) * 2
 
-    say_missing(scan, {"Alignment/X-Shifts": "0", "Alignment/Y-Shifts": "0", f"{_INFO}/XrayGeometry": "a cone",
-                       f"{_INFO}/ExpTimes": "none"})  # fmt: skip
+    say_missing(scan, {"Alignment/X-Shifts": "0", "Alignment/Y-Shifts": "0", beam: "a cone",
+                       _EXPOSURES: "none"})  # fmt: skip
     if scan.has("ReconSettings/CenterShift") and (shift := scan.first_of("ReconSettings/CenterShift")):
         text = "%s is %g pixels and not used, for its sign is not documented: check --fix-offset or calibrate find the axis"
         _log.warning(text, scan.name("ReconSettings/CenterShift"), shift)
     if is_cone:
-        to_axis_mm = options.taken("source_to_axis_mm", lambda: scan.steady(f"{_INFO}/StoRADistance"))
-        to_detector_mm = options.taken(
-            "source_to_detector_mm", lambda: to_axis_mm + scan.steady(f"{_INFO}/DtoRADistance")
-        )
+        to_axis_mm = options.taken("source_to_axis_mm", lambda: scan.steady(distances[0]))
+        to_detector_mm = options.taken("source_to_detector_mm", lambda: to_axis_mm + scan.steady(distances[1]))
         pitch_mm = partial(pixel_mm, to_detector_mm / to_axis_mm)
         geometry: Geometry = assemble.cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, (0.0, 0.0))
     else:

@@ -71,7 +71,8 @@ PHASE = _quantity("phase", "cycle", 1e9, {
     ("cycle", "cycles"): 1.0, ("deg", "degree", "degrees", "\u00b0"): 1 / 360, ("rad", "radian", "radians"): 0.5 / math.pi
 })  # fmt: skip
 ATTENUATION = _quantity("attenuation", "1/mm", 1e9, {
-    ("1/mm", "mm^-1", "mm-1"): 1.0, ("1/cm", "cm^-1", "cm-1"): 0.1, ("1/m", "m^-1", "m-1"): 1e-3
+    ("1/mm", "mm^-1", "mm-1"): 1.0, ("1/cm", "cm^-1", "cm-1"): 0.1, ("1/m", "m^-1", "m-1"): 1e-3,
+    ("1/µm", "1/um", "µm^-1", "um^-1", "µm-1", "um-1"): 1e3,
 })  # fmt: skip
 
 
