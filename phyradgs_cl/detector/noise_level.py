@@ -29,6 +29,7 @@ _RELATIVE = 2e-5  # an estimate shows noise only if (estimated noise) / (largest
 # Frames show noise if (estimate along both axes) / (estimate along rows alone) exceeds this. Structure gives less.
 _WHITE = 0.5
 _ROOT_OF_NORMAL = 0.8222  # mean of √|x| / √(standard deviation of x), for a normal variable x with mean 0
+_NOISY_AIR = 0.45  # air has no noise if fewer than this share of pixels are not 0: in clipped noise half of them are not
 _NEAR = 9  # the noise of a pixel is estimated from a square of this side around it
 
 
@@ -38,8 +39,7 @@ def robust_deviation(values: np.ndarray) -> float:
 
 
 def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) -> float:
-    """Returns the standard deviation of a pixel's noise behind the object, dimensionless. Without usable pixels it is 0, and
-    where most pixels have no noise.
+    """Returns the standard deviation of a pixel's noise behind the object, dimensionless. Without usable pixels it is 0.
 
     It comes from the median of |second differences| along rows, where line integrals (F, v, u) are above 0. An object is
     smooth compared with white noise, and a median ignores edges (Donoho and Johnstone, Biometrika 81 (1994) 425). Detail as
@@ -50,6 +50,9 @@ def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | 
     usable = np.ones(middle.shape, bool) if valid is None else np.logical_and.reduce(_threes(valid, -1))
     if not usable.any():
         return 0.0
+    if np.count_nonzero(middle[usable]) < _NOISY_AIR * np.count_nonzero(usable):
+        frames = _some(line_integrals)
+        return _rms_above(0.0, frames, np.ones(frames.shape, bool) if valid is None else _some(valid))
     # Zeros may be clipped noise. Pixels from the median on count too: those above 0 may be edges of small bodies alone.
     usable &= (middle > 0) | (middle >= np.median(middle[usable], overwrite_input=True))
     pixels = np.flatnonzero(usable)
@@ -103,12 +106,22 @@ def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) 
     """Returns the root mean square of the noise behind the object, dimensionless, from some frames. line_integrals, valid:
     (F, v, u).
 
-    Air is left out: its noise is lower, and in some files clipped at 0. The smaller of two estimates is taken, for edges of
-    small bodies raise the one without air."""
-    some = slice(None, None, max(1, len(line_integrals) // _FRAMES))
-    frames, usable = line_integrals[some], valid[some]
-    behind = usable & (frames > _BEHIND * noise_level(frames, usable))
-    return min(noise_rms(frames, behind, valid) for valid in (behind, usable))
+    Air is left out: its noise is lower, and in some files clipped at 0."""
+    frames, usable = _some(line_integrals), _some(valid)
+    return _rms_above(_BEHIND * noise_level(frames, usable), frames, usable)
+
+
+def _some(frames: NDArray[Any]) -> NDArray[Any]:
+    return frames[:: max(1, len(frames) // _FRAMES)]
+
+
+def _rms_above(least: float, frames: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
+    """Returns the root mean square of the noise of the ``valid`` pixels (F, v, u) above ``least``, without air. Where most of
+    them are at an edge of a small body, a median takes edges for noise: then it is at most the estimate with air."""
+    behind = valid & (frames > least)
+    inner = scipy.ndimage.binary_erosion(behind, np.ones((1, 3, 3)), border_value=1)
+    has_edges = 2 * np.count_nonzero(inner) < np.count_nonzero(behind)
+    return min(noise_rms(frames, behind, usable) for usable in ((behind, valid) if has_edges else (behind,)))
 
 
 def _threes(frames: NDArray[Any], axis: int) -> tuple[NDArray[Any], ...]:
