@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from phyradgs_cl.acquisition import CircularOrbit, Scan
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, Scan, pixel_centres
+from phyradgs_cl.api import static_scan
 from phyradgs_cl.check import CheckResult
+from phyradgs_cl.phantoms import EllipsoidPhantom
 
 
 def verdicts(found: CheckResult) -> dict[str, str]:
@@ -46,3 +48,12 @@ def cropped(scan: Scan, part: Any, **geometry: Any) -> Scan:
     panel = replace(scan.geometry, detector_shape=frames.shape[1:], **geometry)
     orbit = CircularOrbit(panel, scan.trajectory.kinematics)
     return replace(scan, projections=frames, geometry=panel, trajectory=orbit)
+
+
+def cone_scan(phantom: EllipsoidPhantom, angles_deg: np.ndarray, noise: float) -> Scan:
+    """A stop-and-shoot scan of closed-form line integrals and white noise, whose deviation is ``noise``."""
+    geometry = ConeGeometry(5.0, 7.0, (32, 32), 0.125)
+    pixels = pixel_centres(poses := geometry.pose(np.deg2rad(angles_deg)), geometry.detector_shape)
+    frames = phantom.line_integrals(np.broadcast_to(poses[:, None, None, :3], pixels.shape), pixels)
+    frames = frames + np.random.default_rng(7).normal(0, noise, frames.shape)
+    return static_scan(frames.astype(np.float32), geometry, angles_deg)

@@ -2,10 +2,10 @@
 
 A coarse reconstruction of consistent frames leaves a far smaller residual than one of the same frames in a random order. If
 it does not, or if another hypothesis leaves less than half the squared residual, something stated is wrong. The steps:
-remove odd frames; choose the sense of rotation and the panel's shift (``orbit.py`` reports them); remove outliers; compare
-with random orders; try hypotheses."""
+remove odd frames; take at most 60 of the others; choose the sense of rotation and the panel's shift (``orbit.py`` reports
+them); remove outliers; compare with random orders; try hypotheses; compare all other frames with the volume of the 60."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
@@ -14,11 +14,12 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.angles import has_opposite_views, start_azimuths_rad, wrapped
-from phyradgs_cl.acquisition.altered.coarse import some_frames
+from phyradgs_cl.acquisition.altered.coarse import MOST_FRAMES, some_frames, spread_evenly
 from phyradgs_cl.acquisition.altered.variants import altered_trajectory, reversed_rotation, shifted
 from phyradgs_cl.check import hypotheses
 from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding
 from phyradgs_cl.check.hypotheses import Hypothesis, frame_number
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.detector import noise_level, robust_deviation
 from phyradgs_cl.reconstructors.fits import axis
 from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares, t_statistic
@@ -27,7 +28,6 @@ from phyradgs_cl.runtime import Runtime
 CONSISTENCY = "consistency"
 # Frames are consistent if (RMS residual) / (that in a random order) is at most this: correct scans have 0.02 to 0.23.
 _LARGEST = 0.35
-_DOUBTFUL = 0.1  # missing and repeated frames are tried if (residual) / (residual in a random order) exceeds this
 _RANDOM_ORDERS = 2  # number of random orders over which their squared residual is averaged
 _FEWEST_FRAMES = 5  # fewer frames cannot tell one order from another
 _FEWEST_PIXELS = 32  # fewer valid coarse pixels per frame cannot tell one order from another
@@ -37,6 +37,9 @@ _ERRORS = 4.0  # a hypothesis's squared residual must be below the stated scan's
 # Limits of the RMS residual in a random order. Below either limit, the object looks the same from every angle.
 _SAME = 0.03  # an object looks alike from all angles below this (residual in a random order) / (σ of line integrals)
 _NOISY = 1.6  # an object looks alike from all angles below this (residual in a random order) / (noise): round ones had 1.3
+# Noise explains an RMS residual below this fraction of the noise in the mean of a block's pixels: 0.33, because the frames
+# are smoothed, and a fifth more for uneven noise.
+_SMOOTHED = 0.4
 _MOST_REFINED = 2  # only this many hypotheses, the best ones, get a refined shift of the panel, which takes time
 _SHIFT_PENALTY = 1.5  # factor on a hypothesis's squared residual per coarse pixel of shift: stated offsets are mostly right
 # An odd frame exceeds two limits of its change, which is |its mean line integral − median of its neighbours' means|.
@@ -46,12 +49,16 @@ _REPEATED = 0.15  # a frame repeats the last one if (its change) / (least change
 _JUMP = 2.5  # an order jumps, as the golden angle does, if (its median step) / (median step of sorted angles) exceeds this
 _UNLIKE = 2.0  # where an order jumps, least (RMS difference of a repeated frame from the next view in angle) / (its median)
 _OUTLIER = 4.0  # least (RMS residual of an outlier) / (median RMS residual of the frames)
+# Least (RMS residual of an outlier) / (that in a random order), and / (RMS difference of the outlier from the frames' mean):
+# right frames, along a thin plate without noise, had up to 0.2; frames at 90 % of their contrast have at least 0.27.
+_LEAST_OUTLIER = 0.22
+_MOST_FITTED = 5 / 6  # of more than 60 frames, at most this fraction is fitted: the others need a median of their own
 # Frames at both ends of an arc may fit badly if the ratio of their residuals is below this: right frames had 1.4, odd 2.3.
 _ALIKE = 1.7
 # Frames at both ends may fit badly only if (residual) / (that in a random order) is below this: right ones had 0.2, odd 0.3.
 _AT_BOTH_ENDS = 0.25
 _MOST_OUTLIERS = 0.2  # if this fraction of the frames or more are outliers, they have a common cause, and none is removed
-_EXCHANGED = 0.5  # two frames were exchanged if their exchange leaves less than this fraction of the squared residual
+_EXCHANGED = 0.5  # two frames were exchanged if their exchange leaves less than this fraction of their squared residuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,30 +75,42 @@ class Consistency:
 def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
     """Finds whether the frames of a coarse ``scan`` fit together, and else frames and hypotheses that explain why not.
 
-    The finding's value is (RMS residual in the stated order) / (that in a random order). as_stated: the full scan."""
+    The finding's value is (RMS residual in the stated order) / (that in a random order). as_stated: the full scan. Both have
+    all frames, and each is looked at. At most 60 of them, spread evenly, are fitted, and judge the others."""
     pixels = float(scan.valid.sum()) / scan.frames
     if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
         finding = Finding(CONSISTENCY, CANNOT_TELL, 0.0, _LARGEST, "share", text)
         return Consistency(finding, np.arange(scan.frames), False, False)
-    frames, notes = without_odd_frames(scan)
-    turned, best, rough_square = _best_sense(rt, some_frames(scan, frames))
+    right, notes = without_odd_frames(scan)
+    most = MOST_FRAMES if len(right) <= MOST_FRAMES else min(MOST_FRAMES, int(_MOST_FITTED * len(right)))
+    fitted = right[spread_evenly(len(right), most)]
+    turned, best, rough_square = _best_sense(rt, some_frames(scan, fitted))
     random_total = _random_order(rt, best)
-    remaining, stated, outlier_notes = without_outliers(rt, best, fit(rt, best), random_total / best.frames)
-    frames, notes = frames[remaining], notes + outlier_notes
-    if outlier_notes:
+    remaining, stated = without_outliers(rt, best, fit(rt, best), random_total / best.frames)
+    frames, outliers = fitted[remaining], np.delete(fitted, remaining)
+    if outliers.size:
         turned, best = some_frames(turned, remaining), some_frames(best, remaining)
         random_total = _random_order(rt, best)
     ratio = float(np.sqrt(stated.total / max(random_total, 1e-30)))
+    every = replace(scan, trajectory=replace(altered_trajectory(best), frames=altered_trajectory(scan).frame_numbers(scan)))
 
     def answer(verdict: str, text: str, advice: str, is_sound: bool, sees_angles: bool = True) -> Consistency:
-        finding = Finding(CONSISTENCY, verdict, ratio, _LARGEST, "share", "; ".join([*notes, text]), advice)
+        texts = [*notes, *_about_outliers(rt, every, stated, outliers), text]
+        finding = Finding(CONSISTENCY, verdict, ratio, _LARGEST, "share", "; ".join(texts), advice)
         return Consistency(finding, frames, is_sound, sees_angles)
 
-    about_frames = "exclude these frames (image_key 3), or correct them; further answers do not use them" if notes else ""
+    def answer_about_frames(verdict: str, text: str, sees_angles: bool) -> Consistency:
+        nonlocal outliers
+        outliers = np.union1d(outliers, _misfits(rt, every, stated, np.setdiff1d(right, fitted), random_total / best.frames))
+        if not notes and not outliers.size:
+            return answer(verdict, text, "", True, sees_angles)
+        advice = "exclude these frames (image_key 3), or correct them; further answers do not use them"
+        return answer(SUSPICIOUS, text, advice, True, sees_angles)
+
     if ratio > _LARGEST and random_total <= best.frames * _unseen(best, as_stated) ** 2:
         text = "the frames differ too little from angle to angle: a wrong order or wrong angles would not show"
-        return answer(SUSPICIOUS if notes else CANNOT_TELL, text, about_frames, True, sees_angles=False)
+        return answer_about_frames(CANNOT_TELL, text, sees_angles=False)
     text = f"residual {ratio:.2g} of that of the frames in a random order"
     scans = some_frames(scan, frames), turned, best
     hypothesis = _explanation(rt, *scans, as_stated, stated, random_total, rough_square)
@@ -101,13 +120,24 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
         text = "detector_offset puts the axis of rotation beside the panel, where frames fit under any geometry"
         advice = "compare detector_offset and pixel sizes, and their units, with the scanner's log"
         return answer(SUSPICIOUS, text, advice, False)
+    if ratio > _LARGEST and stated.total <= best.frames * (_SMOOTHED * _noises(best, as_stated)[1]) ** 2:
+        text = f"the frames' noise leaves {ratio:.2g} of the residual of a random order: a wrong order would hardly show"
+        return answer_about_frames(CANNOT_TELL, text, sees_angles=True)
     if ratio > _LARGEST:
         doubtful = "distances and pixel sizes, flats and the panel's tilt"
         if scan.is_parallel:
             doubtful = "flats and the panel's roll"
         advice = f"compare order and orientation of the frames, angles, {doubtful} with the scanner's log"
         return answer(SUSPICIOUS, f"frames do not fit together, cause not found: {text}", advice, False)
-    return answer(SUSPICIOUS if notes else OK, text, about_frames, True)
+    return answer_about_frames(OK, text, sees_angles=True)
+
+
+def _noises(scan: Scan, as_stated: Scan) -> tuple[float, float]:
+    """Returns two estimates of the noise of coarse pixels: from themselves, and from the means of full pixels.
+
+    scan: the coarse scan. as_stated: the full scan."""
+    levels = [noise_level(one.projections, np.broadcast_to(one.valid, one.projections.shape)) for one in (scan, as_stated)]
+    return levels[0], levels[1] / float(np.prod(altered_trajectory(scan).blocks)) ** 0.5
 
 
 def _unseen(scan: Scan, as_stated: Scan) -> float:
@@ -115,9 +145,7 @@ def _unseen(scan: Scan, as_stated: Scan) -> float:
 
     scan: the coarse scan. as_stated: the full scan."""
     # The smaller of two estimates is taken: edges raise the one from coarse pixels, uneven noise the one from full pixels.
-    levels = [noise_level(one.projections, np.broadcast_to(one.valid, one.projections.shape)) for one in (scan, as_stated)]
-    noise = min(levels[0], levels[1] / float(np.prod(altered_trajectory(scan).blocks)) ** 0.5)
-    return max(_SAME * float(np.asarray(scan.projections, np.float64).std()), _NOISY * noise)
+    return max(_SAME * float(np.asarray(scan.projections, np.float64).std()), _NOISY * min(_noises(scan, as_stated)))
 
 
 def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
@@ -167,9 +195,21 @@ def _explanation(
             return hypothesis
     if hypotheses.stated_redundancy(as_stated) < 0:
         return None
-    tries_orders = fitted.total > _DOUBTFUL**2 * random_total
-    candidates = chain(about_scan, hypotheses.of_frames(turned, best, tries_orders))
+    candidates = chain(about_scan, hypotheses.of_frames(turned, best), _best_gaps(rt, turned, as_stated))
     return _best_below(rt, candidates, fitted, min(_CLEAR * fitted.total, _LARGEST**2 * random_total))
+
+
+def _best_gaps(rt: Runtime, scan: Scan, as_stated: Scan) -> Iterator[Hypothesis]:
+    """Yields the hypotheses that a frame is missing and that one is there twice, each at the place where it fits best. The
+    place is sought in a quarter of the scan, then in an eighth, and so on, because frames on its wrong side fit badly."""
+    for is_missing in (True, False):
+        squares: dict[int, float] = {}
+        at, step = scan.frames // 2, scan.frames // 4
+        while step:
+            for place in {at - step, at, at + step} - set(squares):
+                squares[place] = fit_squares(rt, hypotheses.of_gap(scan, as_stated, place, is_missing).scan()).sum()
+            at, step = min(squares, key=lambda place: squares[place]), step // 2
+        yield hypotheses.of_gap(scan, as_stated, at, is_missing)
 
 
 def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:
@@ -270,36 +310,56 @@ def _neighbours(values: np.ndarray) -> np.ndarray:
     return np.stack([wide[:-4], wide[1:-3], wide[3:-1], wide[4:]])
 
 
-def without_outliers(
-    rt: Runtime, scan: Scan, stated: Fit, random_square: float
-) -> tuple[np.ndarray, Fit, list[str]]:
+def without_outliers(rt: Runtime, scan: Scan, stated: Fit, random_square: float) -> tuple[np.ndarray, Fit]:
     """Removes frames whose RMS residual is 4 times the median or more, the worst first, with a new fit after each.
 
     stated: the fit of all frames. random_square: the mean squared residual of frames in a random order. Returns the indices
-    (n,) of the frames that stay, their fit, and notes. If a fifth of the frames are outliers, they have a common cause, and
-    none is removed. If two outliers fit in exchanged order, the note says so."""
+    (n,) of the frames that stay, and their fit. If a fifth of the frames are outliers, they have a common cause, and none is
+    removed."""
     remaining, current = np.arange(scan.frames), stated
-    outliers: list[int] = []
-    while len(outliers) < _MOST_OUTLIERS * scan.frames:
+    while scan.frames - len(remaining) < _MOST_OUTLIERS * scan.frames:
         size = np.sqrt(current.squares)
-        size[_ends_alike(size, random_square**0.5)] = 0
+        is_outlier = _are_outliers(some_frames(scan, remaining), size, random_square**0.5)
+        size[~is_outlier | _ends_alike(size, random_square**0.5)] = 0
         worst = int(np.argmax(size))
-        if size[worst] < _OUTLIER * np.sqrt(np.median(current.squares)):
-            break
-        outliers.append(int(remaining[worst]))
+        if size[worst] == 0:
+            return remaining, current
         remaining = np.delete(remaining, worst)
         current = fit(rt, some_frames(scan, remaining))
-    if not outliers or len(outliers) >= _MOST_OUTLIERS * scan.frames:
-        return np.arange(scan.frames), stated, []
-    numbers = sorted(frame_number(scan, f) for f in outliers)
-    frames, do = ("frames", "do") if len(outliers) > 1 else ("frame", "does")
-    note = f"{frames} {', '.join(map(str, numbers))} (from 0) {do} not fit the others"
+    return np.arange(scan.frames), stated
+
+
+def _are_outliers(scan: Scan, residual: np.ndarray, random: float) -> np.ndarray:
+    """Returns which frames are outliers, bool (F,). residual (F,): each frame's RMS residual. random: as for
+    ``_ends_alike``. A frame that differs much from the others, as one along a plate does, may have a larger residual."""
+    p = np.where(scan.valid, scan.projections, 0)
+    differences = np.array([_rms(frame) for frame in p - p.mean(0)])
+    return residual >= np.maximum(_OUTLIER * np.median(residual), _LEAST_OUTLIER * np.maximum(differences, random))
+
+
+def _misfits(rt: Runtime, scan: Scan, fitted: Fit, left_out: np.ndarray, random_square: float) -> np.ndarray:
+    """Returns which of the frames ``left_out`` (n,), indices of frames of ``scan``, are outliers by their residuals from the
+    volume of other frames. random_square: as for ``without_outliers``."""
+    if not left_out.size:
+        return left_out
+    groups = np.array_split(left_out, ceil_div(left_out.size, MOST_FRAMES))  # all at once would take much memory
+    squares = np.concatenate([fitted.squares_of(rt, some_frames(scan, group)) for group in groups])
+    return left_out[_are_outliers(some_frames(scan, left_out), np.sqrt(squares), random_square**0.5)]
+
+
+def _about_outliers(rt: Runtime, scan: Scan, fitted: Fit, outliers: np.ndarray) -> list[str]:
+    """Returns a note about the frames ``outliers`` (n,), indices of frames of ``scan``; none without. The note says if two
+    outliers fit in exchanged order. fitted: the fit of frames without them."""
+    if not outliers.size:
+        return []
+    numbers = [str(frame_number(scan, f)) for f in outliers]
     if len(outliers) == 2:
-        order = np.arange(scan.frames)
-        order[outliers] = order[outliers[::-1]]
-        if fit_squares(rt, replace(scan, projections=scan.projections[order])).sum() < _EXCHANGED * stated.total:
-            note = f"frames {numbers[0]} and {numbers[1]} (from 0) fit if their order is exchanged"
-    return remaining, current, [note]
+        pair = some_frames(scan, outliers)
+        exchanged = replace(pair, projections=pair.projections[::-1])
+        if fitted.squares_of(rt, exchanged).sum() < _EXCHANGED * fitted.squares_of(rt, pair).sum():
+            return [f"frames {numbers[0]} and {numbers[1]} (from 0) fit if their order is exchanged"]
+    frames, do = ("frames", "do") if len(outliers) > 1 else ("frame", "does")
+    return [f"{frames} {', '.join(numbers)} (from 0) {do} not fit the others"]
 
 
 def _ends_alike(residual: np.ndarray, random: float) -> np.ndarray:

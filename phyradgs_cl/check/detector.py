@@ -9,6 +9,7 @@ from scipy.ndimage import median_filter
 from phyradgs_cl.acquisition import Saturation, Scan
 from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding, outer_median
+from phyradgs_cl.check.hypotheses import frame_number
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.detector.noise_level import clustered_share
 from phyradgs_cl.prepare.bad_pixels import LEAST_FRAMES, axis_column, find_dead
@@ -149,7 +150,7 @@ def check_gain(rt: Runtime, scan: Scan) -> Finding:
     angle, frames = start_azimuths_rad(scan), np.arange(scan.frames)
     turning = np.stack([np.ones(scan.frames), np.cos(angle), np.sin(angle)], 1)
     shapes = {"from the first frame to the last": np.linspace(-0.5, 0.5, scan.frames)}
-    shapes |= {f"at frame {at} (from 0)": (frames >= at).astype(float) for at in range(3, scan.frames - 2)}
+    shapes |= {_step_place(scan, at): (frames >= at).astype(float) for at in range(3, scan.frames - 2)}
     fits = {where: _fit_change(turning, shape, level) for where, shape in shapes.items()}
     where, (change, deviation, _) = min(fits.items(), key=lambda item: item[1][2])
     change = math.expm1(-change)  # a larger gain gives smaller line integrals
@@ -159,6 +160,12 @@ def check_gain(rt: Runtime, scan: Scan) -> Finding:
         return Finding(GAIN, verdict, change, _LARGEST_DRIFT, "share", text, uncertainty=deviation)
     advice = "take flats before and after the scan, or normalise each frame by a patch of air"
     return Finding(GAIN, SUSPICIOUS, change, _LARGEST_DRIFT, "share", text, advice, deviation)
+
+
+def _step_place(scan: Scan, at: int) -> str:
+    """Returns in words where a step before the frame with index ``at`` is in the file, which may have more frames."""
+    last, first = frame_number(scan, at - 1), frame_number(scan, at)
+    return f"at frame {first} (from 0)" if first - last == 1 else f"between frames {last} and {first} (from 0)"
 
 
 def _fit_change(turning: np.ndarray, shape: np.ndarray, level: np.ndarray) -> tuple[float, float, float]:

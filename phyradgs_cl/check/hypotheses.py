@@ -22,7 +22,6 @@ _FANS = (0.02, 3.0)  # range of (panel's width / panel's distance from the sourc
 _GRID_FACTOR = 3.0  # a grid this many times wider or narrower than the panel's view has wrong sizes too, and is replaced
 _SAME_PLACE = 1.0  # shifts of the panel that differ by less, in coarse pixels, look the same
 _ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)  # changes of the angle between views, in percent, that are tried
-_GAPS = 15  # number of places, evenly spread over the frames, at which a missing or repeated frame is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,16 +131,14 @@ def _matching_grid(stated: Scan, panel_grid: Grid) -> Grid:
     return panel_grid if is_derived or not 1 / _GRID_FACTOR < ratio < _GRID_FACTOR else stated.grid
 
 
-def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hypothesis]:
-    """Yields hypotheses about a coarse scan: other steps of its angles, exchanged pixel sizes (of ``shifted_scan``, its copy
-    with the best shift of the panel) and, with ``tries_orders``, a missing or repeated frame."""
+def of_frames(scan: Scan, shifted_scan: Scan) -> Iterator[Hypothesis]:
+    """Yields hypotheses about a coarse scan: other steps of its angles, and exchanged pixel sizes (of ``shifted_scan``, its
+    copy with the best shift of the panel)."""
     yield from _other_steps(scan)
     v, u = scan.geometry.pixel_size_mm
     if not scan.is_parallel and abs(v / u - 1) > 0.02:  # parallel rays: another object would fit as well
         text, advice = "pixel sizes fit if v and u are exchanged", f"exchange {PIXEL_SIZES}"
         yield Hypothesis(text, advice, partial(variants.stretched, shifted_scan, u / v, v / u))
-    if tries_orders:
-        yield from _missing_frames(scan)
 
 
 def _azimuths(scan: Scan) -> np.ndarray:
@@ -184,17 +181,19 @@ def nearly_sized(scan: Scan, factor: float) -> Scan:
     return replace(variants.resized(scan, factor, keeps_axis=True), grid=grid)
 
 
-def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:
-    """Yields, for up to 15 places, the hypotheses that a frame is missing there, or there twice. Their corrections turn all
-    later frames one step of the angles forwards or backwards."""
+def of_gap(scan: Scan, stated: Scan, at: int, is_missing: bool) -> Hypothesis:
+    """Returns the hypothesis that a frame is missing before the frame with index ``at`` of a coarse scan, or that one is
+    there twice. Its correction gives each later frame the angle of the frame behind it in ``stated``, the full scan, or of
+    the frame before it."""
     sense = -1.0 if variants.altered_trajectory(scan).is_reversed else 1.0
-    step = float(np.median(wrapped(np.diff(_azimuths(scan))))) * sense
-    for at in np.unique(np.linspace(1, scan.frames - 1, _GAPS).round().astype(int)):
-        later = (np.arange(scan.frames) >= at) * step
-        number = frame_number(scan, int(at))
-        text = f"a frame is missing near frame {number} (from 0): later frames fit one step further on"
-        advice = "find the missing frame, or shift the angles behind it by a step"
-        yield Hypothesis(text, advice, partial(variants.turned, scan, later))
-        text = f"a frame is there twice near frame {number} (from 0): later frames fit one step before"
+    steps_rad = wrapped(np.diff(start_azimuths_rad(stated)))  # (n,): from each frame of the full scan to the one behind it
+    ends_rad = np.median(steps_rad)  # beyond the last frame and the first
+    numbers, frames = (variants.altered_trajectory(one).frame_numbers(one) for one in (stated, scan))
+    turns_rad = np.r_[steps_rad, ends_rad] if is_missing else -np.r_[ends_rad, steps_rad]
+    later_rad = sense * turns_rad[np.searchsorted(numbers, frames)] * (np.arange(scan.frames) >= at)
+    text = f"a frame is missing near frame {frame_number(scan, at)} (from 0): later frames fit one step further on"
+    advice = "find the missing frame, or shift the angles behind it by a step"
+    if not is_missing:
+        text = f"a frame is there twice near frame {frame_number(scan, at)} (from 0): later frames fit one step before"
         advice = "take the frame out, so that later ones get their own angles"
-        yield Hypothesis(text, advice, partial(variants.turned, scan, -later))
+    return Hypothesis(text, advice, partial(variants.turned, scan, later_rad))

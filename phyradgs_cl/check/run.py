@@ -107,15 +107,15 @@ def check(
     covered = answers.add(coverage.check_coverage(scan))
     if covered.unit in (coverage.NO_OBJECT, coverage.OPAQUE, coverage.TOO_BRIGHT):
         return answers.stop()
-    quick = quick_scan(scan)
-    consistent = consistency.check_consistency(rt, quick, scan)
+    every = quick_scan(scan)
+    consistent = consistency.check_consistency(rt, every, scan)
     found = consistent.finding
     if noisy and found.verdict == SUSPICIOUS:
         found = replace(found, verdict=CANNOT_TELL, text=f"rests on {coverage.NOISE}: {SUSPICIOUS}", advice="")
     answers.add(found)
     if not consistent.is_sound:
         return answers.stop()
-    quick = some_frames(quick, consistent.frames)
+    quick = some_frames(every, consistent.frames)
     turn = orbit.find_orbit(rt, quick, scan, consistent.sees_angles)
     answers.add(turn.sign)
     answers.add(turn.centre)
@@ -131,7 +131,7 @@ def check(
         gain = replace(gain, verdict=CANNOT_TELL, text=f"{gain.text}, or the object does beyond the panel")
     answers.add(gain)
     if shutter.READOUT in questions:
-        fine = some_frames(coarse(scan, FINE_COLUMNS), consistent.frames)
+        fine = coarse(some_frames(scan, consistent.frames), FINE_COLUMNS)
         ask(shutter.READOUT, shutter.check_readout, around_object(turn.corrected(fine)))
     if shutter.EXPOSURE in questions:
         ask(shutter.EXPOSURE, shutter.check_exposure, quick)
@@ -142,11 +142,11 @@ def check(
 
 
 def quick_scan(scan: Scan) -> Scan:
-    """Returns the coarse scan for all questions that need a reconstruction, except the question about the readout.
+    """Returns the coarse scan, with all frames, for all questions that need a reconstruction, except that about the readout.
 
     If the axis is near the panel's edge, the grid is cut to the object: with many voxels of air, the few frames of a coarse
     scan would fit under wrong angles too."""
-    quick = coarse(scan, QUICK_COLUMNS)
+    quick = coarse(scan, QUICK_COLUMNS, scan.frames)
     return around_object(quick, _SPARE_COLUMNS) if has_axis_near_edge(scan) else quick
 
 

@@ -1,19 +1,23 @@
-"""Frames that do not belong to a scan are found at its ends as in its middle, and its ends are not blamed for a drift."""
+"""Frames that do not belong to a scan are found at its ends, in its middle and beside the frames that are fitted. Its ends
+are not blamed for a drift, nor right frames for edges along a few rays."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from check_kit import some_frames
+from check_kit import cone_scan, some_frames
 from parallel_kit import BODIES, line_integrals, parallel_scan
 from scipy.ndimage import shift
 
 from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Scan, Shutter
+from phyradgs_cl.acquisition.altered.coarse import QUICK_COLUMNS, coarse, spread_evenly
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, ConstantSpeed
 from phyradgs_cl.check.consistency import check_consistency, repeated_frames
+from phyradgs_cl.check.detector import check_gain
 from phyradgs_cl.check.finding import OK, SUSPICIOUS
 from phyradgs_cl.check.run import quick_scan
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, rotation_about_z
 
 pytestmark = pytest.mark.slow
 
@@ -34,7 +38,7 @@ def answer(rt, scan: Scan) -> tuple[str, str]:
 
 CHANGES = {
     "moved": lambda frame: shift(frame, (0, 2), order=1, mode="nearest"), "mirrored": lambda frame: frame[:, ::-1],
-    "faint": lambda frame: 0.7 * frame, "rolled": lambda frame: np.roll(frame, 6, axis=1),
+    "faint": lambda frame: 0.7 * frame, "rolled": lambda frame: np.roll(frame, 6, axis=1), "black": lambda frame: frame + 9,
 }  # fmt: skip
 
 
@@ -80,3 +84,44 @@ def test_frames_that_agree_in_masked_pixels_alone_are_not_repeated(arcs) -> None
     filled = np.where(mask, p[20], p)
     assert repeated_frames(replace(scan, projections=filled, pixel_mask=mask)) == []
     assert repeated_frames(replace(scan, projections=np.where(mask, p[20], p[[*range(20), 20, 20, *range(22, 60)]]))) == [21]
+
+
+@pytest.fixture(scope="module")
+def long() -> Scan:
+    """More views than a check fits."""
+    return cone_scan(BODIES, np.arange(110) * 360 / 110, 0.003)
+
+
+BESIDE = [int(frame) for frame in np.setdiff1d(np.arange(110), spread_evenly(110, 60))][3::12]  # not fitted
+
+
+@pytest.mark.parametrize(("order", "changes", "said"), [
+    ([], {BESIDE[0]: "moved", BESIDE[1] + 1: "faint", BESIDE[2]: "mirrored"},
+     f"frames {BESIDE[0]}, {BESIDE[1] + 1}, {BESIDE[2]} (from 0) do not fit the others"),
+    ([BESIDE[0], BESIDE[2]], {}, f"frames {BESIDE[0]} and {BESIDE[2]} (from 0) fit if their order is exchanged"),
+    ([BESIDE[1], BESIDE[3] + 1], {}, f"frames {BESIDE[1]} and {BESIDE[3] + 1} (from 0) fit if their order is exchanged"),
+    ([], {BESIDE[1]: "black"}, f"frame {BESIDE[1]} is unlike all others (black, bright, or no image)"),
+    ([], {BESIDE[3]: "the last"}, f"frame {BESIDE[3]} is frame {BESIDE[3] - 1} recorded twice"),
+    ([], {}, None),
+])  # fmt: skip
+def test_every_frame_of_a_long_scan_is_looked_at(rt, long, order, changes, said) -> None:
+    frames = long.projections.copy()
+    frames[order] = frames[order[::-1]]
+    for at, change in changes.items():
+        frames[at] = frames[at - 1] if change == "the last" else CHANGES[change](frames[at])
+    verdict, text = answer(rt, replace(long, projections=frames))
+    assert (verdict, text) == (SUSPICIOUS, said) if said else verdict == OK
+
+
+def test_a_step_of_the_gain_is_placed_among_the_frames_of_the_file(rt, long) -> None:
+    frames = long.projections + 0.1 * (np.arange(110) >= 80)[:, None, None]
+    text = check_gain(rt, coarse(replace(long, projections=frames.astype(np.float32)), QUICK_COLUMNS)).text
+    before, after = (int(word) for word in text.split("between frames ")[1].split(" (")[0].split(" and "))
+    assert before < 80 <= after <= before + 2
+
+
+@pytest.mark.parametrize("half_mm", [0.08, 0.12])
+def test_views_along_a_plate_are_not_odd(rt, half_mm) -> None:
+    """Without noise the usual residual is tiny, and rays along the plate leave several times as much."""
+    plate = EllipsoidPhantom((Ellipsoid((0.0, 0.0, 0.0), (1.1, half_mm, 0.9), 1.0, rotation_about_z(0.2)),), "plate")
+    assert answer(rt, cone_scan(plate, np.arange(90) * 4.0, 0.0))[0] == OK

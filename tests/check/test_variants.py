@@ -7,7 +7,7 @@ import pytest
 from check_kit import cropped, negative, stated
 
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Shutter, pixel_centres
-from phyradgs_cl.acquisition.altered.coarse import binned
+from phyradgs_cl.acquisition.altered.coarse import binned, smooth
 from phyradgs_cl.acquisition.altered.variants import reversed_readout, reversed_rotation, shifted
 from phyradgs_cl.reconstructors.fits.residuals import residual_ratio, t_statistic, vertex
 
@@ -73,6 +73,15 @@ def test_masked_pixels_are_left_out_of_their_block(clean) -> None:
     expected = (p[:, 4, 7] + p[:, 5, 6] + p[:, 5, 7]) / 3
     np.testing.assert_allclose(small.projections[:, 2, 3], expected, rtol=1e-6)
     assert np.argwhere(small.pixel_mask[0]).tolist() == [[4, 4]]
+
+
+def test_blocks_of_smoothed_pixels_are_those_of_smoothed_frames_and_take_nothing_of_masked_ones(clean) -> None:
+    np.testing.assert_allclose(binned(clean, 5, 4.0).projections, binned(smooth(clean, 4.0), 5).projections, atol=1e-6)
+    mask = np.random.default_rng(0).random(clean.projections.shape) < 0.05
+    ramp = np.broadcast_to(np.arange(32, dtype=np.float32), mask.shape)
+    masked = replace(clean, projections=np.where(mask, np.float32(1e4), ramp), pixel_mask=mask)
+    means = binned(replace(clean, projections=ramp), 5, 4.0).projections
+    np.testing.assert_allclose(binned(masked, 5, 4.0).projections, means, atol=0.6)
 
 
 def test_vertices_of_parabolas_and_the_standing_of_hypotheses() -> None:

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from check_kit import negative, stated, suspected, verdicts
+from check_kit import cone_scan, negative, stated, suspected, verdicts
+from parallel_kit import BODIES
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry
 from phyradgs_cl.acquisition.geometry import default_grid
@@ -116,6 +117,30 @@ def test_a_step_of_the_angles_that_is_stated_wrong(rt, clean, factor, said) -> N
     finding = next(f for f in found.suspicious if f.question == "consistency")
     assert said in finding.text and "354" not in finding.text
     assert {f.question for f in found.suspicious} <= {"consistency", "angles"}
+
+
+@pytest.mark.parametrize(("views", "step_deg", "at"), [(40, 9.0, 26), (24, -15.0, 7), (72, 10.0, 51), (90, 100.0, 33)])
+@pytest.mark.parametrize("is_missing", [True, False])
+def test_a_lost_or_doubled_frame_is_no_wrong_step(rt, views, step_deg, at, is_missing) -> None:
+    """Nor is it where more views follow each other than are fitted, or where an order jumps."""
+    angles_deg = np.arange(views + 1) * step_deg
+    true_deg = np.delete(angles_deg, at) if is_missing else np.insert(angles_deg[:-2], at, angles_deg[at - 1])
+    frames = cone_scan(BODIES, true_deg, 0.003).projections
+    scan = replace(cone_scan(BODIES, angles_deg[:-1], 0.003), projections=frames)
+    text = consistency.check_consistency(rt, quick_scan(scan), scan).finding.text
+    kind, place = text.split(" near frame ")
+    assert kind.endswith("a frame is missing" if is_missing else "a frame is there twice")
+    assert abs(int(place.split(" ")[0]) - at) <= 2
+
+
+@pytest.mark.parametrize(("order", "verdict"), [(None, CANNOT_TELL), (4, SUSPICIOUS)])
+def test_noise_about_a_small_bead_raises_no_alarm_but_a_wrong_order_does(rt, order, verdict) -> None:
+    bead = EllipsoidPhantom((Ellipsoid((-0.5, 0.3, 0.2), (0.11, 0.11, 0.11), 1.0),), "bead")
+    scan = cone_scan(bead, np.arange(40) * 9.0, 0.012)
+    frames = scan.projections if order is None else np.random.default_rng(order).permutation(scan.projections)
+    scan = replace(scan, projections=frames)
+    finding = consistency.check_consistency(rt, quick_scan(scan), scan).finding
+    assert finding.verdict == verdict and finding.value > finding.threshold, finding
 
 
 def test_counts_that_begin_again_at_zero(rt, still) -> None:

@@ -23,8 +23,8 @@ _LEAST_COLUMNS = 12  # least number of blocks from left to right, if the panel h
 _NARROW = 3  # divides a block's side if the panel is lower than two blocks, because one row of blocks tells little
 
 
-def coarse(scan: Scan, columns: int) -> Scan:
-    """Returns the scan with at most 60 frames, pixels averaged in blocks, a coarse grid, and no true volumes.
+def coarse(scan: Scan, columns: int, most_frames: int = MOST_FRAMES) -> Scan:
+    """Returns the scan with at most ``most_frames`` frames, pixels averaged in blocks, a coarse grid, and no true volumes.
 
     The panel's longer side has at most ``columns`` blocks. It has more if the panel would else have fewer than 12 blocks
     from left to right, or fewer than two from bottom to top."""
@@ -32,7 +32,7 @@ def coarse(scan: Scan, columns: int) -> Scan:
     block = min(math.ceil(max(shape) / columns), max(1, shape[1] // _LEAST_COLUMNS))
     if 2 * block > shape[0]:
         block = math.ceil(block / _NARROW)
-    small = binned(smooth(fewer_frames(scan, MOST_FRAMES), SMOOTHING * block), block)
+    small = binned(fewer_frames(scan, most_frames), block, SMOOTHING * block)
     return replace(small, grid=coarse_grid(scan.grid, small.geometry))
 
 
@@ -55,9 +55,12 @@ def smooth(scan: Scan, pixels: float | tuple[float, float]) -> Scan:
 
 def fewer_frames(scan: Scan, most: int) -> Scan:
     """Returns the scan with at most ``most`` of its frames, spread evenly."""
-    if scan.frames <= most:
-        return scan
-    return some_frames(scan, np.unique(np.linspace(0, scan.frames - 1, most).round().astype(int)))
+    return scan if scan.frames <= most else some_frames(scan, spread_evenly(scan.frames, most))
+
+
+def spread_evenly(count: int, most: int) -> np.ndarray:
+    """Returns at most ``most`` of the indices below ``count``, spread evenly, with the first and the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
 def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
@@ -74,31 +77,44 @@ def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
     )
 
 
-def binned(scan: Scan, block: int) -> Scan:
+def binned(scan: Scan, block: int, smoothing_px: float = 0.0) -> Scan:
     """Returns the scan with blocks of ``block`` × ``block`` pixels averaged to one pixel, and without true volumes.
 
-    A block is never larger than the panel. Only valid pixels are averaged. A block is masked if fewer than half of its
-    pixels are valid. The last rows and columns are dropped if they fill no block. A block of lines opens at the mean of its
-    lines' opening times."""
-    if block == 1:
+    smoothing_px: the standard deviation of a Gaussian that smooths the frames before; 0 does not. A block is never larger
+    than the panel. Only valid pixels are averaged. A block is masked if fewer than half of its pixels are valid. The last
+    rows and columns are dropped if they fill no block. A block of lines opens at the mean of its lines' opening times."""
+    if block == 1 and not smoothing_px:
         return replace(scan, reference=None, moving_truth=None)
-    height, width = blocks = tuple(min(block, count) for count in scan.geometry.detector_shape)
-    rows, columns = scan.geometry.detector_shape[0] // height, scan.geometry.detector_shape[1] // width
-    shape = (scan.frames, rows, height, columns, width)
-    inside = (slice(None), slice(rows * height), slice(columns * width))
-    weight = scan.valid[inside].reshape(shape)
-    values = np.asarray(scan.projections)[inside].reshape(shape)
-    valid_share = weight.mean((2, 4))
-    mean = (values * weight).mean((2, 4)) / np.where(valid_share > 0, valid_share, 1.0)
-    is_masked = valid_share < _LEAST_VALID
+    panel = scan.geometry.detector_shape
+    height, width = blocks = tuple(min(block, count) for count in panel)
+    plain, smoothed = ([_averages(*sides, px) for sides in zip(panel, blocks, strict=True)] for px in (0.0, smoothing_px))
+
+    def average(image: np.ndarray, weights: list[np.ndarray]) -> np.ndarray:
+        return np.asarray(weights[0] @ image @ weights[1].T)
+
+    # one frame after the other, because copies of all would take much memory
+    mean, valid_share = np.empty((2, scan.frames, panel[0] // height, panel[1] // width), np.float32)
+    for frame, (p, valid) in enumerate(zip(scan.projections, scan.valid, strict=True)):
+        weight = valid.astype(np.float32)
+        mean[frame] = average(p * weight, smoothed) / np.maximum(average(weight, smoothed), 1e-6)
+        valid_share[frame] = average(weight, plain)
+    is_masked = valid_share < _LEAST_VALID - 1e-6  # less the rounding of the sum
     of_lines = width if scan.shutter.axis == "columns" else height
     shutter, later_s = scan.shutter.of_lines(scan.lines, 0, scan.lines // of_lines * of_lines, of_lines)
     return replace(
-        scan, projections=mean.astype(np.float32), geometry=_binned_panel(scan.geometry, height, width),
+        scan, projections=mean, geometry=_binned_panel(scan.geometry, height, width),
         trajectory=with_trajectory(scan, blocks=blocks).trajectory, shutter=shutter,
         frame_start_s=np.asarray(scan.frame_start_s) + later_s,
         pixel_mask=is_masked if is_masked.any() else None, reference=None, moving_truth=None,
     )
+
+
+def _averages(count: int, block: int, smoothing_px: float) -> np.ndarray:
+    """Returns the weights (blocks, count) float32 of ``count`` pixels in the means of blocks, of smoothed pixels."""
+    means = np.kron(np.eye(count // block), np.full(block, 1 / block))
+    means = np.pad(means, ((0, 0), (0, count % block)))
+    smoothed = scipy.ndimage.gaussian_filter1d(means, smoothing_px, truncate=3) if smoothing_px else means
+    return np.asarray(smoothed, np.float32)
 
 
 def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:

@@ -122,20 +122,30 @@ class AugmentedOperator:
 @dataclass(frozen=True, eq=False)
 class Fit:
     """Result of ``fit``. squares (F,): mean squared residual of each frame, dimensionless. level (F,): the constant that the
-    fit added to each frame's line integrals."""
+    fit added to each frame's line integrals. volume (nz, ny, nx), pattern (rows, columns): what it added to all frames."""
 
     squares: np.ndarray
     level: np.ndarray
+    volume: np.ndarray
+    pattern: np.ndarray
 
     @property
     def total(self) -> float:
         return float(self.squares.sum())
 
+    def squares_of(self, rt: Runtime, scan: Scan) -> np.ndarray:
+        """Returns the mean squared residual (F,) of each frame of another scan of the same object and panel, dimensionless.
+        A frame's level is free."""
+        system = _system(rt, scan)
+        residual = system.measured - system.operator.forward(self.volume) - self.pattern
+        weight = scan.valid / np.maximum(scan.valid.sum((1, 2), keepdims=True), 1)
+        residual -= (weight * residual).sum((1, 2), keepdims=True)
+        return np.asarray((weight * np.square(residual, dtype=np.float64)).sum((1, 2)))
+
 
 def fit(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> Fit:
     """Fits a volume to a coarse scan by CGLS, with every line at its own times, together with errors of the scan's flats."""
-    times = min(max(2, math.ceil(rim_travel_voxels(scan))), _MOST_TIMES)
-    system = System.of_scan(rt, scan, PerRow(times), fewest_lines=FEWEST_LINES)
+    system = _system(rt, scan)
     flats = FlatErrors.beside(system.operator)
     augmented = AugmentedOperator(system.operator, flats)
     method = Cgls(augmented.system(system.measured, system.valid))
@@ -144,8 +154,14 @@ def fit(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> Fit:
             break
         method.step()
     squares = np.square(method.residual, dtype=np.float64).mean((1, 2))
-    _, values = augmented.parts(method.volume)
-    return Fit(squares, flats.parts(values)[1])
+    volume, values = augmented.parts(method.volume)
+    pattern, level = flats.parts(values)
+    return Fit(squares, level, volume, pattern)
+
+
+def _system(rt: Runtime, scan: Scan) -> System:
+    times = min(max(2, math.ceil(rim_travel_voxels(scan))), _MOST_TIMES)
+    return System.of_scan(rt, scan, PerRow(times), fewest_lines=FEWEST_LINES)
 
 
 def fit_squares(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> np.ndarray:
