@@ -271,6 +271,7 @@ def estimate_views(
     for number, stage in enumerate(stages):
         problem = CoarseProblem.of(rt, [scan], stage, scan.frames)
         problem = replace(problem, count_pass=passes.counter(pass_cost([scan], stage.columns, scan.frames)))
+        compared = problem.without_cut_ends()
         former, volume = parameters.values, None
         is_kept = ~np.isin(np.arange(len(parameters.KINDS)), parameters.FINE)
         parameters = replace(parameters, values=former * is_kept)
@@ -278,9 +279,9 @@ def estimate_views(
         for _ in range(_STEPS):
             operator = parameters.operator(problem, correction)
             volume = problem.reconstruct(operator, volume, stage.first if volume is None else stage.again)
-            step, signals = view_step(problem, correction, parameters, volume, kinds, _ITERATIONS)
+            step, signals = view_step(compared, correction, parameters, volume, kinds, _ITERATIONS)
             parameters = replace(parameters, values=parameters.without_gauges(parameters.values + step))
-    noise, shares = view_deviations(problem, correction, parameters, signals, _ITERATIONS)
+    noise, shares = view_deviations(compared, correction, parameters, signals, _ITERATIONS)
     change = _rms_over_views(parameters, parameters.values - former)
     kinds_before = parameters.kinds_of_stage(len(stages) - 2, len(stages)) if len(stages) > 1 else []
     was_estimated = np.isin(np.arange(len(parameters.KINDS)), kinds_before)

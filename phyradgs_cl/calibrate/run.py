@@ -38,15 +38,7 @@ from phyradgs_cl.calibrate.per_view import (
     passes_of_views,
 )
 from phyradgs_cl.calibrate.placing import WRONG_PHANTOM, bead_centres_mm, placements
-from phyradgs_cl.calibrate.problem import (
-    CoarseProblem,
-    PassCounter,
-    Passes,
-    Report,
-    Stage,
-    pass_cost,
-    reaches_ends,
-)
+from phyradgs_cl.calibrate.problem import CoarseProblem, PassCounter, Passes, Report, Stage, pass_cost
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, Calibration, ParameterEstimate, rms
 from phyradgs_cl.calibrate.search import Fallback, Problem, Search
 from phyradgs_cl.check import SUSPICIOUS
@@ -67,9 +59,6 @@ STAGES = (
     Stage(96, first=50, again=15, steps=3, project=30),
 )
 BEAD_STAGES = (Stage(48, first=8, again=4, steps=6, project=0), Stage(128, first=6, again=4, steps=6, project=0))
-# Factor on ``project`` with matter beyond a cone beam's first or last row: a volume explains slowly what few views see,
-# and with less of it removed a roll came out at half its value. Of objects cut at the sides too little of a signal remained.
-_MORE_AT_ENDS = 3
 _FEWEST_FRAMES = 8  # with fewer frames a scan does not determine its geometry
 _FEWEST_COLUMNS = 12  # with fewer columns a scan does not determine its geometry
 _FEWEST_SPLINES = 4  # cubic splines need at least four coefficients
@@ -128,11 +117,9 @@ class _Calibrator:
     def __post_init__(self) -> None:
         self.placement = np.zeros(0)
         self.stated = self.ready  # the scans as stated: ``ready`` may later get the other readout direction
-        is_low = self.phantom is None and not self.is_cut and reaches_ends(self.ready[0])
-        more = _MORE_AT_ENDS if is_low else 1
         stages = {one.block(self.scan): one for one in reversed(STAGES if self.phantom is None else BEAD_STAGES)}
         # on a small panel several stages have blocks of the same size: the first stage of each size is kept
-        self.stages = [replace(one, is_cut=self.is_cut, project=more * one.project) for one in reversed(stages.values())]
+        self.stages = [replace(one, is_cut=self.is_cut) for one in reversed(stages.values())]
         self.per_view: PerViewParameters | None = None
         if self.request.per_view == WOBBLE:
             self.per_view = WobbleParameters.of(self.ready[0], self.splines)

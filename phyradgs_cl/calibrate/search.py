@@ -218,6 +218,7 @@ class Search:
     def descend(self, problem: Problem, stage: Stage) -> None:
         """Moves the parameters on the grid of ``stage`` until the steps are small, at most ``stage.steps`` times."""
         volume: np.ndarray | None = None
+        compared = problem.without_cut_ends() if isinstance(problem, CoarseProblem) else problem
         asks = self.determined is None
         self.former = {} if asks or isinstance(problem, BeadProblem) else dict(self.at)
         for number in range(stage.steps):
@@ -225,7 +226,7 @@ class Search:
             operator: Any = problem.operator(correction_of(self.at))
             volume = problem.reconstruct(operator, volume, stage.again if number else stage.first)
             more = GAUGES if asks and isinstance(problem, CoarseProblem) else ()
-            linear = reduced(problem, operator, [*parameters, *more], self.at, volume, stage.project)
+            linear = reduced(compared, operator, [*parameters, *more], self.at, volume, stage.project)
             if asks:
                 self._decide_determined(linear)
             self.reduced = self._possible(linear.relative_to_stated(self.at))
