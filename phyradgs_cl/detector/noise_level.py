@@ -116,8 +116,8 @@ def _some(frames: NDArray[Any]) -> NDArray[Any]:
 
 
 def _rms_above(least: float, frames: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
-    """Returns the root mean square of the noise of the ``valid`` pixels (F, v, u) above ``least``, without air. Where most of
-    them are at an edge of a small body, a median takes edges for noise: then it is at most the estimate with air."""
+    """Returns the root mean square of the noise of the ``valid`` pixels (F, v, u) above ``least``, without air. Where most
+    of them lie at edges of small bodies, a median takes edges for noise: then it is at most the estimate with air."""
     behind = valid & (frames > least)
     inner = scipy.ndimage.binary_erosion(behind, np.ones((1, 3, 3)), border_value=1)
     has_edges = 2 * np.count_nonzero(inner) < np.count_nonzero(behind)
