@@ -275,7 +275,7 @@ def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
     options = run.options
     # a resumed run keeps its stages, also on a device with another room
     kept = None if run.resume is None else run.resume.get(STAGES)
-    gains = _gains_from_subvoxels(run, 2) if kept is None else _SUBVOXELS in kept
+    gains = _gains_from_subvoxels(run, 2) if kept is None else _SUBVOXELS.encode() in kept.tobytes()
     parts = options.subvoxels or (2 if gains else 1)
     first = round(_COARSE_SHARE * options.iterations) if parts > 1 else 0
     last = options.iterations - first

@@ -15,7 +15,7 @@ from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.voxels.run import MethodRun, WithFacts
 
-# Names of arrays in a state: the stage's number, its first volume, and the names of all the run's stages.
+# Names of arrays in a state: the stage's number, its first volume, and the names of all the run's stages, with commas.
 _STAGE, _VOLUME, STAGES = "stage", "volume_before", "stages"
 
 
@@ -101,8 +101,8 @@ class Stages:
 
     def state(self) -> dict[str, np.ndarray]:
         volume = {} if self._index == 0 or self.before is None else {_VOLUME: self.before}
-        names = np.array([stage.name for stage in self.stages])
-        return {**self.method.state(), **volume, _STAGE: np.array(self._index), STAGES: names}
+        names = ",".join(stage.name for stage in self.stages).encode()
+        return {**self.method.state(), **volume, _STAGE: np.array(self._index), STAGES: np.frombuffer(names, np.uint8)}
 
     def restore(self, state: State) -> None:
         self.method.restore(state)
