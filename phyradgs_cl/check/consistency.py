@@ -274,9 +274,9 @@ def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
 
 def repeated_frames(scan: Scan) -> list[int]:
     """Returns the indices of frames that repeat their predecessor although the gantry has turned: they differ from it by
-    less than 0.15 times the least change between frames nearby. In an order that jumps, such as the golden angle, distant
-    views of a round object may look the same. In such an order a repeated frame must also differ from the next view in
-    angle."""
+    less than 0.15 times the least change between frames nearby, apart from the level, because light may be uneven. In an
+    order that jumps, such as the golden angle, distant views of a round object may look the same. In such an order a
+    repeated frame must also differ from the next view in angle."""
     p = scan.projections
     if len(p) < _FEWEST_FRAMES:
         return []
@@ -284,7 +284,7 @@ def repeated_frames(scan: Scan) -> list[int]:
 
     def apart(one: int, other: int) -> float:
         seen = valid[one] & valid[other]
-        return _rms((p[other] - p[one])[seen]) if seen.any() else np.inf
+        return float(np.std((p[other] - p[one])[seen], dtype=np.float64)) if seen.any() else np.inf
 
     steps = np.array([apart(frame, frame + 1) for frame in range(len(p) - 1)])
     azimuths_rad = start_azimuths_rad(scan)
@@ -305,9 +305,11 @@ def _rms(image: np.ndarray) -> float:
 
 
 def _neighbours(values: np.ndarray) -> np.ndarray:
-    """Returns (4, F): for each of ``values`` (F,), the two values before and the two after it. The ends are mirrored."""
-    wide = np.r_[values[2:0:-1], values, values[-2:-4:-1]]
-    return np.stack([wide[:-4], wide[1:-3], wide[3:-1], wide[4:]])
+    """Returns (4, F): for each of ``values`` (F,), the two values before and the two after it; at the ends, the four
+    nearest. Of fewer than five values it returns all others."""
+    at = np.arange(len(values))[:, None]
+    near = np.clip(at - 2, 0, max(len(values) - 5, 0)) + np.arange(min(5, len(values)))
+    return np.asarray(values[near[near != at].reshape(len(values), -1)].T)
 
 
 def without_outliers(rt: Runtime, scan: Scan, stated: Fit, random_square: float) -> tuple[np.ndarray, Fit]:

@@ -12,7 +12,7 @@ from scipy.ndimage import shift
 from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Scan, Shutter
 from phyradgs_cl.acquisition.altered.coarse import QUICK_COLUMNS, coarse, spread_evenly
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, ConstantSpeed
-from phyradgs_cl.check.consistency import check_consistency, repeated_frames
+from phyradgs_cl.check.consistency import check_consistency, odd_frames, repeated_frames
 from phyradgs_cl.check.detector import check_gain
 from phyradgs_cl.check.finding import OK, SUSPICIOUS
 from phyradgs_cl.check.run import quick_scan
@@ -125,3 +125,18 @@ def test_views_along_a_plate_are_not_odd(rt, half_mm) -> None:
     """Without noise the usual residual is tiny, and rays along the plate leave several times as much."""
     plate = EllipsoidPhantom((Ellipsoid((0.0, 0.0, 0.0), (1.1, half_mm, 0.9), 1.0, rotation_about_z(0.2)),), "plate")
     assert answer(rt, cone_scan(plate, np.arange(90) * 4.0, 0.0))[0] == OK
+
+
+@pytest.mark.parametrize("light", [0.0, 0.01, 0.05])
+def test_doubles_are_found_at_every_place_and_uneven_light_and_a_blank_frame_make_none(arcs, light) -> None:
+    """Each frame has noise of its own."""
+    scan = arcs["cone, full"]
+    rng = np.random.default_rng(4)
+    p = scan.projections + rng.normal(0, 0.002, scan.projections.shape) + rng.normal(0, light, (len(scan.projections), 1, 1))
+    assert repeated_frames(replace(scan, projections=p)) == []
+    for f in (1, 2, 3, 30, len(p) - 3, len(p) - 2, len(p) - 1):
+        doubled, blank = p.copy(), p.copy()
+        doubled[f], blank[f] = p[f - 1], 0
+        assert repeated_frames(replace(scan, projections=doubled)) == [f]
+        assert repeated_frames(replace(scan, projections=blank)) == []
+        assert light or odd_frames(blank, None) == [f]
